@@ -1,7 +1,5 @@
 """The command line: options from files and arguments, errors and exit codes, help, and which package imports which."""
 
-from __future__ import annotations
-
 import ast
 import json
 import os
@@ -30,7 +28,7 @@ CONFIGS = ROOT / "configs"
     "path", sorted({*CONFIGS.glob("*.yaml")} - {CONFIGS / "own-meshes.yaml"}), ids=lambda path: path.stem
 )
 @pytest.mark.parametrize("command", ["train", "release"])
-def test_a_shipped_configuration_serves_every_command(path: Path, command: str) -> None:
+def test_a_shipped_configuration_serves_every_command(path, command):
     Path("data").mkdir()
     Path("data", "release").symlink_to(ROOT / "data" / "release")
     assert parse_command(command, ["--config", str(path)]).name == path.stem
@@ -56,12 +54,12 @@ def test_a_shipped_configuration_serves_every_command(path: Path, command: str) 
         ("demo", f"--label.localizer.seed=7 --config {CONFIGS}/demo.yaml", "scenes.train", 3),
     ],
 )  # fmt: skip
-def test_ways_to_write_options(command: str, arguments: str | list[str], name: str, value: object) -> None:
+def test_ways_to_write_options(command, arguments, name, value):
     found = parse_command(command, arguments.split() if isinstance(arguments, str) else arguments)
     assert attrgetter(name)(found) == value
 
 
-def test_python_and_the_command_line_mean_the_same() -> None:
+def test_python_and_the_command_line_mean_the_same():
     arguments = ["--name", "a", "--mapping.n_images", "5", "--camera.fov_deg", "60"]
     parsed = parse_command("release", arguments)
     assert parsed.mapping == MapConfig(n_images=5)
@@ -95,13 +93,13 @@ def test_python_and_the_command_line_mean_the_same() -> None:
         "view --scene a --film a.webp", "view --map m --path a.csv --film a.webp",
     ],
 )  # fmt: skip
-def test_wrong_arguments_exit_with_two(arguments: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_wrong_arguments_exit_with_two(arguments, capsys):
     assert main(arguments.split()) == 2
     errors = capsys.readouterr().err
     assert errors.startswith("wheretolook: error: ") and "Traceback" not in errors
 
 
-def test_the_configuration_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_configuration_is_printed(capsys):
     with pytest.raises(SystemExit):
         main(["scenes", "--name", "mine", "--print_config"])
     assert capsys.readouterr().out.startswith("name: mine\n")
@@ -118,7 +116,7 @@ def test_the_configuration_is_printed(capsys: pytest.CaptureFixture[str]) -> Non
         "a: [\n",
     ],
 )
-def test_an_error_in_a_file_names_the_file(text: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_error_in_a_file_names_the_file(text, tmp_path, capsys):
     path = tmp_path / "settings.yaml"
     path.write_text(text)
     assert main(["map", "--config", str(path)]) == 2
@@ -135,20 +133,18 @@ def test_an_error_in_a_file_names_the_file(text: str, tmp_path: Path, capsys: py
         (["map", "--config", str(CONFIGS / "demo.yml")], "configs/demo.yaml"),
     ],
 )
-def test_the_nearest_name_is_suggested(arguments: list[str], meant: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_nearest_name_is_suggested(arguments, meant, capsys):
     assert main(arguments) == 2
     assert f"Did you mean {meant}?" in capsys.readouterr().err
 
 
-def test_an_option_may_repeat_its_value() -> None:
+def test_an_option_may_repeat_its_value():
     arguments = "--map m --at 1,2,3 --out v.csv --scale 2 --scale 2"
     assert parse_command("select", arguments.split()).scale == 2
 
 
 @pytest.mark.parametrize(("name", "gpus"), [("cuda", 0), ("cuda:3", 1)])
-def test_a_missing_gpu_is_an_error_before_any_work(
-    name: str, gpus: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_missing_gpu_is_an_error_before_any_work(name, gpus, tmp_path, monkeypatch):
     monkeypatch.setattr(devices, "_driver_gpus", lambda: gpus)
     monkeypatch.setattr(devices, "_torch_gpus", lambda: gpus)
     with pytest.raises(ConfigError):
@@ -156,7 +152,7 @@ def test_a_missing_gpu_is_an_error_before_any_work(
     assert parse_command("label", ["--engine", "ray", "--device", name]).warp_device == name  # a cluster may have it
 
 
-def test_devices(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_devices(monkeypatch):
     monkeypatch.setattr(devices, "_driver_gpus", lambda: 2)
     monkeypatch.setattr(devices, "_torch_gpus", lambda: 2)
     names = ("auto", "cpu", "cuda", "cuda:1")
@@ -167,8 +163,8 @@ def test_devices(monkeypatch: pytest.MonkeyPatch) -> None:
         devices.usable_device("cuda")
 
 
-def test_an_interrupt_exits_with_130(monkeypatch: pytest.MonkeyPatch) -> None:
-    def interrupted(arguments: list[str]) -> None:
+def test_an_interrupt_exits_with_130(monkeypatch):
+    def interrupted(arguments):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(cli, "run_command", interrupted)
@@ -176,7 +172,7 @@ def test_an_interrupt_exits_with_130(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize("parse", ["lambda name, rest: Waiting()", "lambda name, rest: Waiting().run()"])
-def test_sigterm_is_an_interrupt(parse: str) -> None:
+def test_sigterm_is_an_interrupt(parse):
     """While options are parsed and afterwards; COLMAP's own handler prints a native stack."""
     code = """
 import time
@@ -197,7 +193,7 @@ class Waiting:
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_an_interrupt_during_an_import_is_not_swallowed(number: signal.Signals, tmp_path: Path) -> None:
+def test_an_interrupt_during_an_import_is_not_swallowed(number, tmp_path):
     module = "import time\nprint('ready', flush=True)\ntry:\n    time.sleep(1)\nexcept BaseException:\n    pass\n"
     (tmp_path / "swallowing.py").write_text(module)
     code = """
@@ -218,7 +214,7 @@ raise SystemExit(cli.main(["map"]))
 
 
 @pytest.mark.parametrize("arguments", [["--help"], ["select", "--help"], ["evaluate", "--list-methods"]])
-def test_a_closed_output_ends_a_command_silently(arguments: list[str]) -> None:
+def test_a_closed_output_ends_a_command_silently(arguments):
     reader, writer = os.pipe()
     os.close(reader)
     command = [sys.executable, "-m", "wheretolook", *arguments]
@@ -227,12 +223,12 @@ def test_a_closed_output_ends_a_command_silently(arguments: list[str]) -> None:
     assert done.stderr == b"" and done.returncode in (0, 141)  # argparse ignores that its help was not read
 
 
-def test_debug_shows_the_traceback(capsys: pytest.CaptureFixture[str]) -> None:
+def test_debug_shows_the_traceback(capsys):
     assert main(["scenes", "--camera.width", "0", "--debug"]) == 2
     assert "Traceback" in capsys.readouterr().err
 
 
-def test_listings_hold_nothing_else(capsys: pytest.CaptureFixture[str]) -> None:
+def test_listings_hold_nothing_else(capsys):
     for name in ("demo", "release"):
         Path("data", name).mkdir(parents=True)
     assert main(["evaluate", "--list-methods"]) == 0
@@ -243,14 +239,14 @@ def test_listings_hold_nothing_else(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 @pytest.mark.parametrize("command", cli.command_targets())
-def test_help_explains_every_option(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_help_explains_every_option(command, capsys):
     assert main([command, "--help"]) == 0
     text = capsys.readouterr().out
     missing = [name for name in cli.command_options(cli.load_command(command)) if f"--{name}" not in text]
     assert missing == [] and f"wheretolook {command} " in text
 
 
-def test_usage_lists_every_command(capsys: pytest.CaptureFixture[str]) -> None:
+def test_usage_lists_every_command(capsys):
     assert main([]) == 0
     text = capsys.readouterr().out
     assert all(f"\n  {command} " in text for command in cli.command_targets())
@@ -263,7 +259,7 @@ HEAVY = ("torch", "warp", "scipy", "matplotlib", "mlflow", "pandas", "sklearn", 
     "arguments",
     [["--help"], ["train", "--train.epoch", "10"], ["check", "--scene", "cellar"], ["view", "--scene", "cellar"]],
 )
-def test_help_and_early_errors_import_nothing_heavy(arguments: list[str], tmp_path: Path) -> None:
+def test_help_and_early_errors_import_nothing_heavy(arguments, tmp_path):
     (tmp_path / "data" / "mine" / "hall").mkdir(parents=True)
     dataset = {"camera": {"width": 64, "height": 48, "focal_px": 32.0}, "scenes": [{"name": "hall", "split": "test"}]}
     (tmp_path / "data" / "mine" / "dataset.json").write_text(json.dumps(dataset))
@@ -275,7 +271,7 @@ def test_help_and_early_errors_import_nothing_heavy(arguments: list[str], tmp_pa
     assert done.stderr.splitlines()[-1] == ""
 
 
-def test_packages_import_only_what_is_below_them() -> None:
+def test_packages_import_only_what_is_below_them():
     allowed = {
         "wheretolook": {"wheretolook"},
         "wheretolook_rooms": {"wheretolook", "wheretolook_rooms"},

@@ -1,7 +1,5 @@
 """The documentation: it builds without a warning, its code runs, its commands are real, its numbers the release's."""
 
-from __future__ import annotations
-
 import re
 import shlex
 import shutil
@@ -35,7 +33,7 @@ BLOCK = re.compile(NOT_RUN + r"^```(?P<language>\w*)\n(?P<code>.*?)^```$", re.M 
 CHECKED = ("python", "sh")  # in these languages; in others, such as text and toml, there is nothing to run
 
 
-def blocks(page: Path, language: str) -> list[str]:
+def blocks(page, language):
     """Blocks of code of a page in a language, but for those that say why they are not run."""
     found = list(BLOCK.finditer(page.read_text()))
     return [block["code"] for block in found if block["language"] == language and block["why"] is None]
@@ -45,7 +43,7 @@ def blocks(page: Path, language: str) -> list[str]:
 
 
 @pytest.mark.skipif(find_spec("mkdocs") is None, reason="mkdocs is not installed: pip install '.[docs]'")
-def test_the_site_builds_without_a_warning(tmp_path: Path) -> None:
+def test_the_site_builds_without_a_warning(tmp_path):
     command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path / "site")]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
@@ -60,7 +58,7 @@ def test_the_site_builds_without_a_warning(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("page", PAGES, ids=NAMES)
-def test_links_lead_to_files_and_headings(page: Path) -> None:
+def test_links_lead_to_files_and_headings(page):
     links = re.findall(r"\]\((?!https?:|mailto:)([^)\s#]*)(?:#([^)\s]+))?\)", page.read_text())
     for target, heading in links:
         path = page.parent / target if target else page
@@ -75,7 +73,7 @@ def test_links_lead_to_files_and_headings(page: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def users_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def users_folder(tmp_path_factory):
     """Return a folder with what the pages expect: a model, a mesh, depth images, waypoints, the release."""
     folder = tmp_path_factory.mktemp("user")
     mesh = furnished_room()
@@ -93,10 +91,10 @@ def users_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.filterwarnings("ignore::UserWarning")
 @pytest.mark.parametrize("page", [page for page in PAGES if blocks(page, "python")], ids=lambda page: page.name)
-def test_python_blocks_run(page: Path, users_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_python_blocks_run(page, users_folder, tmp_path, monkeypatch):
     shutil.copytree(users_folder, tmp_path / "user", symlinks=True)
     monkeypatch.chdir(tmp_path / "user")
-    names: dict[str, object] = {"__name__": page.stem}
+    names = {"__name__": page.stem}
     for code in blocks(page, "python"):
         exec(compile(code, str(page), "exec"), names)  # blocks of a page build on one another
     if page.name in ("README.md", "quickstart.md"):
@@ -108,14 +106,14 @@ def test_python_blocks_run(page: Path, users_folder: Path, tmp_path: Path, monke
 # --- shell blocks: options are real
 
 
-def commands(page: Path) -> list[list[str]]:
+def commands(page):
     """Commands of a page's shell blocks, without comments and settings of the environment."""
     found = []
     for code in blocks(page, "sh"):
         for line in code.replace("\\\n", " ").splitlines():
             lexer = shlex.shlex(line, posix=True, punctuation_chars="&|;")
             lexer.whitespace_split = True
-            words: list[str] = []
+            words = []
             for word in [*lexer, ";"]:
                 if set(word) <= set("&|;"):
                     found.append(words)
@@ -125,7 +123,7 @@ def commands(page: Path) -> list[list[str]]:
     return [words for words in found if words]
 
 
-def check_wheretolook(arguments: list[str]) -> None:
+def check_wheretolook(arguments):
     """Raise, or fail, if there is no such command or option."""
     command, *rest = arguments
     if {"--help", "--list", "--list-methods"} & {*rest}:
@@ -135,7 +133,7 @@ def check_wheretolook(arguments: list[str]) -> None:
 
 
 @pytest.mark.parametrize("page", [page for page in PAGES if blocks(page, "sh")], ids=lambda page: page.name)
-def test_shell_blocks_name_real_commands(page: Path) -> None:
+def test_shell_blocks_name_real_commands(page):
     Path("data").mkdir()
     Path("data", "release").symlink_to(ROOT / "data" / "release")
     makefile = (ROOT / "Makefile").read_text()
@@ -162,13 +160,13 @@ NUMBERS = Numbers(ROOT)
 
 
 @pytest.mark.parametrize("page", pages(NUMBERS))
-def test_numbers_are_those_of_the_results(page: str) -> None:
+def test_numbers_are_those_of_the_results(page):
     assert (ROOT / page).read_text() == updated(page, NUMBERS), (
         "python -m wheretolook_paper.studies.results --only pages"
     )
 
 
-def test_a_changed_result_changes_the_page(tmp_path: Path) -> None:
+def test_a_changed_result_changes_the_page(tmp_path):
     shutil.copytree(ROOT / "data" / "release" / "results", tmp_path / "data" / "release" / "results")
     shutil.copytree(ROOT / "docs", tmp_path / "docs")
     path = tmp_path / "data" / "release" / "results" / "looks.csv"
@@ -179,7 +177,7 @@ def test_a_changed_result_changes_the_page(tmp_path: Path) -> None:
     assert text.count("| 12.3 |") == 7 and text != (ROOT / "docs" / "looks.md").read_text()
 
 
-def test_the_table_of_paths_on_photographs_is_that_of_the_release() -> None:
+def test_the_table_of_paths_on_photographs_is_that_of_the_release():
     table, landmarks = read_photograph_paths(Dataset.load(ROOT / "data" / "release"))
     page, made = (
         [[cell.strip() for cell in line.split("|")] for line in text.splitlines() if line[:2] == "| "]

@@ -6,8 +6,6 @@ SCENE is the folder of a mapped scene with `mesh.glb` and `map/`. One process re
 poses batch by batch and synchronizes the device after each step. The first round is not counted.
 """
 
-from __future__ import annotations
-
 import time
 from collections import Counter
 
@@ -24,7 +22,7 @@ from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.rendering.warp_renderer import WarpRenderer
 
 
-def main() -> None:
+def main():
     args = options(__doc__, scene=..., views=256, batches=[8], methods=["first"], device="cpu")
     use_one_thread()
     folder = SceneFolder(args.scene, "test")
@@ -45,7 +43,7 @@ def main() -> None:
         }
         for batch in args.batches:
             for _ in range(2):
-                seconds: Counter[str] = Counter()
+                seconds = Counter()
                 for start in range(0, len(views), batch):
                     result = views[start : start + batch]
                     for name, step in steps.items():

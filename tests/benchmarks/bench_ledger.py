@@ -9,19 +9,14 @@ image by several hypotheses on one core (matching on the device): a tenth of its
 have a twin elsewhere.
 """
 
-from __future__ import annotations
-
-import argparse
 import itertools
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Iterator
 from dataclasses import replace
 from datetime import date
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -43,14 +38,14 @@ KEYPOINTS = 2000
 COLUMNS = ("when", "commit", "device", "what", "median_s", "min_s", "max_s")
 
 
-def visibility(args: argparse.Namespace, device: str) -> Iterator[tuple[str, Callable[[], object]]]:
+def visibility(args, device):
     """Yield names and work of occlusion and counts."""
     setup = Setup(args, device, args.landmarks, args.locations or (648 if setup_on_gpu(device) else 32))
     landmarks = DevicePoints(setup.points, device)
     shared = (CAMERA, rotation_looking_along(fibonacci_sphere(500)), setup.locations, landmarks)
     about = f"{len(setup.locations)} x 500 x {args.landmarks:,}"
 
-    def rays() -> None:
+    def rays():
         setup.occlusion.unoccluded_on_device(setup.locations, landmarks)
         wp.synchronize_device(device)
 
@@ -60,12 +55,12 @@ def visibility(args: argparse.Namespace, device: str) -> Iterator[tuple[str, Cal
     yield f"occlusion alone: {about}", rays
 
 
-def setup_on_gpu(device: str) -> bool:
+def setup_on_gpu(device):
     """Return whether a device is a GPU."""
     return bool(wp.get_device(device).is_cuda)
 
 
-def select(args: argparse.Namespace, device: str, folder: Path) -> Iterator[tuple[str, Callable[[], object]]]:
+def select(args, device, folder):
     """Yield names and work of `wheretolook select` at one waypoint and at 20."""
     write_model(folder / "sparse", args.landmarks)
     for number in (1, 20):
@@ -77,7 +72,7 @@ def select(args: argparse.Namespace, device: str, folder: Path) -> Iterator[tupl
         yield f"select, {number} waypoints x 500 x {args.landmarks:,}, process", work
 
 
-def localization(args: argparse.Namespace, device: str) -> Iterator[tuple[str, Callable[[], object]]]:
+def localization(args, device):
     """Yield names and work of matching an image's keypoints with landmarks, and of estimating its pose from these."""
     rng = np.random.default_rng(0)
     room = room_map(args.landmarks, np.zeros((1, 3)), "cpu").landmarks
@@ -101,13 +96,13 @@ def localization(args: argparse.Namespace, device: str) -> Iterator[tuple[str, C
     yield f"pose of {about}", partial(localizer.estimate, keypoints, matches)
 
 
-def commit() -> str:
+def commit():
     """Return the abbreviated commit, with a plus sign if files are changed; empty outside a repository."""
     command = ["git", "describe", "--always", "--exclude", "*", "--abbrev=7", "--dirty=+"]
     return subprocess.run(command, cwd=LEDGER.parent, capture_output=True, text=True).stdout.strip()
 
 
-def last_entries(ledger: Path, device: str) -> dict[str, dict[str, Any]]:
+def last_entries(ledger, device):
     """Return the last entry of a device in the ledger for each thing that is measured."""
     if not ledger.exists():
         return {}
@@ -115,7 +110,7 @@ def last_entries(ledger: Path, device: str) -> dict[str, dict[str, Any]]:
     return {row["what"]: row for row in table[table["device"] == device].to_dict("records")}
 
 
-def main() -> None:
+def main():
     args = options(
         __doc__,
         device="cpu",
@@ -131,9 +126,9 @@ def main() -> None:
     about = machine(device)
     name = about["name"] if setup_on_gpu(device) else f"{about['host']}, {about['cores']} cores"
     before = last_entries(args.ledger, name)
-    rows: list[dict[str, Any]] = []
+    rows = []
 
-    def add(what: str, work: Callable[[], object], repeats: int) -> None:
+    def add(what, work, repeats):
         times = seconds_of(work, repeats)
         rows.append({"when": date.today().isoformat(), "commit": commit(), "device": name, "what": what, **times})
         last = before.get(what)

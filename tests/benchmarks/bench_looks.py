@@ -6,8 +6,6 @@ The scene folder holds `map/landmarks.npz`, `viewpoints.parquet` and `occlusion.
 computed beforehand and not counted, because a viewpoint map stores them.
 """
 
-from __future__ import annotations
-
 import itertools
 import time
 
@@ -23,7 +21,7 @@ from wheretolook.looks.selection import best_views
 from wheretolook.scorers.weights import load_scorer
 
 
-def main() -> None:
+def main():
     args = options(__doc__, scene=..., looks=3, directions=500, places=30)
     use_one_thread()
     scene = SceneFolder(args.scene, "test")
@@ -33,7 +31,7 @@ def main() -> None:
     directions = direction_lattice(args.directions)
     given = itertools.cycle([*zip(places, scorer.score_directions(places, directions), strict=True)])
 
-    def choose() -> None:
+    def choose():
         place, scores = next(given)
         best_views(scorer, place, directions, scores, args.looks)
 

@@ -7,8 +7,6 @@ loading and scoring, and the same for PyTorch's scorer with the largest differen
 between their scores.
 """
 
-from __future__ import annotations
-
 import itertools
 import tempfile
 import warnings
@@ -26,7 +24,7 @@ from wheretolook.scorers.weights import load_scorer
 from wheretolook.visibility.occlusion import NoOcclusion
 
 
-def main() -> None:
+def main():
     args = options(
         __doc__, weights=Path("data/release/weights/set.safetensors"), landmarks=25_000, directions=500, repeats=500
     )

@@ -9,10 +9,7 @@ landmarks in 500 views at a location as if walls were transparent, and scoring 5
 default scorer, where landmarks of other rooms are occluded.
 """
 
-from __future__ import annotations
-
 import time
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -27,9 +24,8 @@ from wheretolook.features.matching import DescriptorIndex, DescriptorMatcher, ha
 from wheretolook.figures.style import save_figure
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.lattices import fibonacci_sphere
-from wheretolook.geometry.poses import Float, rotation_looking_along
+from wheretolook.geometry.poses import rotation_looking_along
 from wheretolook.inputs.localization_map import LocalizationMap
-from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.scorers.weights import load_scorer
 from wheretolook.utils.warp import start_warp
 from wheretolook.visibility.occlusion import DevicePoints, NoOcclusion, StoredOcclusion
@@ -44,19 +40,19 @@ COUNTED = "count the landmarks of 500 views"
 SCORED = "score 500 views at each location"
 
 
-def room_offset(room: np.ndarray) -> Float:
+def room_offset(room):
     """Return the positions (N, 3) m of rooms by their numbers (N,), in rows of `ROOMS_IN_ROW`."""
     return np.column_stack([room % ROOMS_IN_ROW, room // ROOMS_IN_ROW, np.zeros(len(room))]) * PITCH_M
 
 
-def building(n: int) -> tuple[Landmarks, np.ndarray]:
+def building(n):
     """Return n landmarks in rooms, and the room (n,) of each."""
     landmarks = room_map(n, np.zeros((1, 3)), "cpu").landmarks
     room = np.arange(n) // IN_ROOM
     return replace(landmarks, points=landmarks.points + room_offset(room)), room
 
 
-def scoring(landmarks: Landmarks, room: np.ndarray, count: int) -> Callable[[], object]:
+def scoring(landmarks, room, count):
     """Return the work of scoring 500 views at each of `count` locations in random rooms."""
     rng = np.random.default_rng(1)
     chosen = rng.integers(0, room.max() + 1, count)
@@ -67,7 +63,7 @@ def scoring(landmarks: Landmarks, room: np.ndarray, count: int) -> Callable[[], 
     return lambda: scorer.score_directions(locations, axes)
 
 
-def matching(n: int) -> tuple[str, Callable[[], object]]:
+def matching(n):
     """Return what matches an image with n landmarks, exactly or by the index, and the work of one image."""
     rng = np.random.default_rng(0)
     stored = np.empty((n, 128), dtype=np.uint8)
@@ -80,7 +76,7 @@ def matching(n: int) -> tuple[str, Callable[[], object]]:
     return kind, lambda: match(matcher, [queries], 0.85, 16)
 
 
-def counting(landmarks: Landmarks) -> Callable[[], object]:
+def counting(landmarks):
     """Return the work of counting the landmarks in 500 views at a location, whatever occludes them."""
     rotations = rotation_looking_along(fibonacci_sphere(500))
     points = DevicePoints(landmarks.points, "cpu")
@@ -89,7 +85,7 @@ def counting(landmarks: Landmarks) -> Callable[[], object]:
     return lambda: survey(PinholeCamera(), rotations, place, points, NoOcclusion(), chosen)
 
 
-def main() -> None:
+def main():
     args = options(
         __doc__, landmarks=[2_500, 25_000, 250_000, 2_500_000], locations=[1, 10, 100, 1_000], repeats=5,
         out=Path("scale.csv"), draw=Path, figure=Path("scale.webp"),
@@ -99,9 +95,9 @@ def main() -> None:
         return
     start_warp("cpu")
     use_one_thread()
-    rows: list[dict[str, object]] = []
+    rows = []
 
-    def add(what: str, size: int, work: Callable[[], object], repeats: int, about: str = "") -> None:
+    def add(what, size, work, repeats, about=""):
         times = seconds_of(work, repeats, time.process_time)
         rows.append({"what": what, "size": size, "about": about, **times})
         show(f"{what}, {size:,}", times, about)
@@ -117,7 +113,7 @@ def main() -> None:
     write_csv(pd.DataFrame(rows), args.out)
 
 
-def draw(table: pd.DataFrame, path: Path) -> None:
+def draw(table, path):
     """Draw times by the number of landmarks, and by the number of locations, on logarithmic axes."""
     figure, axes = plt.subplots(1, 2, figsize=(8, 3.2), layout="constrained")
     for axis, names, label in ((axes[0], (MATCHED, COUNTED), "landmarks"), (axes[1], (SCORED,), "locations")):

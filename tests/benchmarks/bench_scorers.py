@@ -8,28 +8,24 @@ The map has 25,000 landmarks on the walls of a room; a random half is occluded f
 direction at many locations. The time runs from poses and unoccluded landmarks to scores in host memory.
 """
 
-from __future__ import annotations
-
 import itertools
 import json
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 from bench_visibility import machine
 from common import ROOM_M, options, room_map, seconds_of, show, timed
+from wheretolook.utils.shipped import WEIGHTS, shipped
 
 from wheretolook.geometry.lattices import fibonacci_sphere
 from wheretolook.geometry.poses import poses_looking_along
-from wheretolook.scorers.base import Scorer
 from wheretolook.scorers.registry import make_scorer
 from wheretolook.scorers.weights import load_scorer
 from wheretolook.utils.errors import WhereToLookError
-from wheretolook.utils.shipped import WEIGHTS, shipped
 
 
-def main() -> None:
+def main():
     """Parse the options, measure and print a table."""
     weights = sorted(shipped(WEIGHTS).glob("*.safetensors"))
     args = options(
@@ -46,7 +42,7 @@ def main() -> None:
     cores = torch.get_num_threads()
     print(f"{len(views):,} views of {args.landmarks:,} landmarks, {np.median(seen):.0f} in view (up to {seen.max()})")
     print(f"on {args.device}, {cores} threads")
-    scorers: dict[str, Scorer] = {"bins": make_scorer("bins", localization_map)}
+    scorers = {"bins": make_scorer("bins", localization_map)}
     for path in args.weights:
         try:
             scorers[path.stem] = load_scorer(path, localization_map)
@@ -62,9 +58,7 @@ def main() -> None:
         print(f"{'':62} {len(views) / median:,.0f} views a second")
 
 
-def inference_steps(
-    scorers: dict[str, Scorer], views: np.ndarray, landmarks: int, repeats: int
-) -> list[dict[str, Any]]:
+def inference_steps(scorers, views, landmarks, repeats):
     """Return rows of `runtimes.csv`: the time to score all directions of one location, and one pose.
 
     `views` (L, D, 3, 4) are poses by location; each repeat is at the next location.

@@ -6,8 +6,6 @@ python tests/benchmarks/bench_select.py --landmarks 25000 --waypoints 20 --repea
 python tests/benchmarks/bench_select.py --landmarks 100000 --waypoints 1000 --cold
 """
 
-from __future__ import annotations
-
 import itertools
 import os
 import resource
@@ -20,13 +18,13 @@ from pathlib import Path
 from common import options, seconds_of, show, write_model, write_waypoints
 
 
-def cpu_seconds() -> float:
+def cpu_seconds():
     """Return the CPU seconds of all processes that have ended."""
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
     return used.ru_utime + used.ru_stime
 
 
-def main() -> None:
+def main():
     args = options(__doc__, landmarks=25_000, waypoints=20, occlusion="none", device="cpu", cold=False, repeats=3)
     with tempfile.TemporaryDirectory() as folder:
         write_model(Path(folder) / "sparse", args.landmarks)
@@ -35,7 +33,7 @@ def main() -> None:
         command += ["--out", "views.csv", "--device", args.device, "--occlusion", args.occlusion]
         runs = itertools.count()
 
-        def select() -> None:
+        def select():
             cache = {"WARP_CACHE_PATH": f"{folder}/kernels-{next(runs)}"} if args.cold else {}
             subprocess.run(command, cwd=folder, check=True, env=os.environ | cache)
 

@@ -9,8 +9,6 @@ not measured. Exits with code 1 if a client met an error.
     python tests/benchmarks/bench_view.py --landmarks 100000 --clients 20 --seconds 60
 """
 
-from __future__ import annotations
-
 import contextlib
 import logging
 import os
@@ -21,7 +19,6 @@ import tempfile
 import threading
 import time
 from pathlib import Path
-from typing import Any
 
 import msgspec
 import numpy as np
@@ -34,30 +31,30 @@ from wheretolook.view.viewed_map import open_map
 COMMAND = [sys.executable, "-c", "import sys; from wheretolook.cli import main; sys.exit(main(sys.argv[1:]))"]
 
 
-def message(kind: str, **fields: Any) -> bytes:
+def message(kind, **fields):
     """Encode a message as a browser sends it."""
     return bytes(msgspec.msgpack.encode({"type": kind, **fields}))
 
 
-def camera_message() -> bytes:
+def camera_message():
     """Encode the message with a browser's camera."""
     pose = {"wxyz": [1, 0, 0, 0], "position": [10, 10, 30], "look_at": [10, 10, 0], "up_direction": [0, 0, 1]}
     return message("ViewerCameraMessage", **pose, fov=1.0, near=0.1, far=99.0, image_height=600, image_width=800)
 
 
-def connected(port: int) -> Any:
+def connected(port):
     """Return a websocket connection to the viewer on a port."""
     import viser
     from websockets.sync.client import connect
 
-    protocol: Any = f"viser-v{viser.__version__}"
+    protocol = f"viser-v{viser.__version__}"
     return connect(f"ws://127.0.0.1:{port}", subprotocols=[protocol], max_size=None)
 
 
 class Client(threading.Thread):
     """A client that reads all messages for some seconds and clicks at random if asked to."""
 
-    def __init__(self, port: int, seconds: float, seed: int, clicks: bool = True) -> None:
+    def __init__(self, port, seconds, seed, clicks=True):
         super().__init__(daemon=True)
         self.port = port
         self.seconds = seconds
@@ -66,7 +63,7 @@ class Client(threading.Thread):
         self.error = ""
         self.clicks = clicks
 
-    def run(self) -> None:
+    def run(self):
         end = time.monotonic() + self.seconds
         try:
             with connected(self.port) as page:
@@ -88,15 +85,15 @@ class Client(threading.Thread):
 class ErrorCounter(logging.Handler):
     """Counts what the viewer and its libraries log as errors."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         super().__init__(logging.ERROR)
         self.n = 0
 
-    def emit(self, record: logging.LogRecord) -> None:
+    def emit(self, record):
         self.n += 1
 
 
-def print_opening(model: Path, repeat: int) -> None:
+def print_opening(model, repeat):
     """Print how long the command takes to open a model."""
     runs = [opening(model) for _ in range(repeat)]
     for row, what in enumerate(("landmarks on the page", "first coloured floor")):
@@ -107,7 +104,7 @@ def print_opening(model: Path, repeat: int) -> None:
         print(f"{what}: {', '.join(parts)}, {repeat} runs", flush=True)
 
 
-def opening(model: Path) -> list[tuple[float, float]]:
+def opening(model):
     """Return wall and CPU seconds from the start of the command to the landmarks and to the first coloured floor."""
     import zstandard
 
@@ -118,7 +115,7 @@ def opening(model: Path) -> list[tuple[float, float]]:
     command = [*COMMAND, "view", "--map", str(model), "--port", str(port)]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     try:
-        times: list[tuple[float, float]] = []
+        times = []
         client = None
         while client is None:
             assert process.poll() is None, "the command has ended"
@@ -139,18 +136,18 @@ def opening(model: Path) -> list[tuple[float, float]]:
         process.wait()
 
 
-def cpu_s(pid: int) -> float:
+def cpu_s(pid):
     """Return the CPU seconds of a process."""
     fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
-def memory_mb() -> float:
+def memory_mb():
     """Return the resident memory of this process."""
     return int(Path("/proc/self/statm").read_text().split()[1]) * 4096 / 2**20
 
 
-def print_turns(session: Any, n: int) -> None:
+def print_turns(session, n):
     """Print how long the score of a view turned by hand takes while the floor fills."""
     session.place.select(np.array([9.0, 9.0, 1.5]))
     while session.location is None:
@@ -169,7 +166,7 @@ def print_turns(session: Any, n: int) -> None:
     print(f"score of a view turned by hand: {median:.0f} ms ({low:.0f} to {high:.0f}), {n} turns", flush=True)
 
 
-def run_clients(viewer: Viewer, n: int, seconds: float) -> int:
+def run_clients(viewer, n, seconds):
     """Connect n clients at once, in two rounds; print traffic and memory, and return how many clients failed."""
     failed = 0
     for round_number in (1, 2):
@@ -187,7 +184,7 @@ def run_clients(viewer: Viewer, n: int, seconds: float) -> int:
     return failed
 
 
-def main() -> int:
+def main():
     """Parse the options, measure and print."""
     args = options(__doc__, map=Path, landmarks=100_000, clients=0, seconds=60.0, occlusion="", repeat=1, turns=20)
     errors = ErrorCounter()

@@ -7,8 +7,6 @@ is `bins` unless weights are given. Queries are at random points in free voxels.
 repeats.
 """
 
-from __future__ import annotations
-
 import tempfile
 from dataclasses import replace
 from itertools import cycle
@@ -33,7 +31,7 @@ from wheretolook.visibility.occlusion import MeshOcclusion
 from wheretolook_rooms.generator import generate_apartment
 
 
-def queries(viewpoint_map: ViewpointMap, n: int, repeats: int) -> None:
+def queries(viewpoint_map, n, repeats):
     """Time queries of single points and of a batch of n points."""
     rng = np.random.default_rng(0)
     grid = viewpoint_map.grid
@@ -44,7 +42,7 @@ def queries(viewpoint_map: ViewpointMap, n: int, repeats: int) -> None:
     axis = np.array([0.6, -0.8, 0.0])
 
     def each(query, points=arrays):
-        def work() -> None:
+        def work():
             for point in points:
                 query(point)
 
@@ -64,7 +62,7 @@ def queries(viewpoint_map: ViewpointMap, n: int, repeats: int) -> None:
     print(f"{'':62} {len(points) / median / 1e6:.1f} million points a second")
 
 
-def sequences(repeats: int, n: int, d: int) -> None:
+def sequences(repeats, n, d):
     """Time the choice of views along a path of n waypoints among d directions."""
     scores = np.random.default_rng(0).random((n, d))
     directions = fibonacci_sphere(d)
@@ -73,7 +71,7 @@ def sequences(repeats: int, n: int, d: int) -> None:
     timed(f"best sequence, {n} waypoints", lambda: best_sequence(scores, limit), repeats)
 
 
-def main() -> None:
+def main():
     """Parse the options, measure and print a table."""
     args = options(
         __doc__, device="cpu", weights=Path, landmarks=25_000, voxels=512, directions=500, repeats=7, builds=3,
@@ -107,7 +105,7 @@ def main() -> None:
     best = directions[viewpoint_map.ranked[:, 0]]
     rows = cycle(range(len(best)))
 
-    def refine_one() -> None:
+    def refine_one():
         row = next(rows)
         refine_directions(scorer, viewpoint_map.locations[row], best[row])
 

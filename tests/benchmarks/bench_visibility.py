@@ -9,9 +9,6 @@ The size is the paper's (Sec. "Runtimes"): 648 locations, 24,919 landmarks and t
 configuration, in a synthetic apartment whose mesh is subdivided into at least 250,000 triangles.
 """
 
-from __future__ import annotations
-
-import argparse
 import contextlib
 import ctypes
 import gc
@@ -21,10 +18,8 @@ import resource
 import sys
 import threading
 import time
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -64,7 +59,7 @@ SCALING = {
 BASE = {"landmarks": 24_919, "locations": 64, "directions": 500}
 
 
-def subdivided(mesh: TexturedMesh, min_triangles: int) -> TexturedMesh:
+def subdivided(mesh, min_triangles):
     """Return an untextured copy of a mesh whose largest triangles are cut into four until there are `min_triangles`."""
     vertices = mesh.vertices.astype(np.float64)
     triangles = mesh.triangles
@@ -83,7 +78,7 @@ def subdivided(mesh: TexturedMesh, min_triangles: int) -> TexturedMesh:
 class Setup:
     """The mesh, landmarks, locations and occlusion of one run."""
 
-    def __init__(self, args: argparse.Namespace, device: str, n_landmarks: int, n_locations: int) -> None:
+    def __init__(self, args, device, n_landmarks, n_locations):
         self.rng = np.random.default_rng(0)
         base = load_mesh(args.scene) if args.scene else generate_apartment(ApartmentConfig(), 0, device=device)
         self.mesh = subdivided(base, args.triangles)
@@ -99,11 +94,11 @@ class Setup:
 class PeakMemory:
     """Measures the peak memory of a block: of the process, or of the device's pool."""
 
-    def __init__(self, device: str) -> None:
+    def __init__(self, device):
         self.device = device
         self.bytes = 0
 
-    def __enter__(self) -> PeakMemory:
+    def __enter__(self):
         gc.collect()
         with contextlib.suppress(OSError, AttributeError):
             ctypes.CDLL("libc.so.6").malloc_trim(0)  # otherwise reuse of freed memory would not be measured
@@ -113,21 +108,21 @@ class PeakMemory:
         self._thread.start()
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, *_):
         self._done.set()
         self._thread.join()
 
-    def _watch(self) -> None:
+    def _watch(self):
         while not self._done.wait(0.0005):
             self.bytes = max(self.bytes, self._now() - self._before)
 
-    def _now(self) -> int:
+    def _now(self):
         if wp.get_device(self.device).is_cuda:
             return int(wp.get_mempool_used_mem_current(self.device))
         return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
 
 
-def machine(device: str) -> dict[str, Any]:
+def machine(device):
     """Return the name of the device and of the host's processor, and the number of usable cores."""
     host = platform.machine()
     with contextlib.suppress(OSError):
@@ -138,7 +133,7 @@ def machine(device: str) -> dict[str, Any]:
     return {"device": device, "name": name, "host": host, "cores": cores(), **versions}
 
 
-def paper_size(args: argparse.Namespace, device: str) -> list[dict[str, Any]]:
+def paper_size(args, device):
     """Time every kind of work at the paper's size, print the times, and return a row for each."""
     setup = Setup(args, device, args.landmarks, args.locations)
     rotations = rotation_looking_along(fibonacci_sphere(args.directions))
@@ -148,9 +143,9 @@ def paper_size(args: argparse.Namespace, device: str) -> list[dict[str, Any]]:
     size["triangles"] = len(setup.mesh.triangles)
     n = args.locations * args.directions * args.landmarks
     print(f"{size}: {n / 1e9:.2f} G projections; {machine(device)}")
-    rows: list[dict[str, Any]] = []
+    rows = []
 
-    def add(what: str, threads: int, work: Callable[[], object], repeats: int = args.repeats, scale: float = 1) -> None:
+    def add(what, threads, work, repeats=args.repeats, scale=1):
         times = seconds_of(work, repeats)
         times |= {name: scale * value for name, value in times.items() if name != "repeats"}
         row = {"what": what, "threads": threads, **size, **times, "scale": scale}
@@ -165,7 +160,7 @@ def paper_size(args: argparse.Namespace, device: str) -> list[dict[str, Any]]:
         add(COUNTS, threads, partial(survey, *shared, NoOcclusion(), SurveyOptions(threads=threads, **counts_only)))
     if setup.on_gpu:
 
-        def cast() -> Any:
+        def cast():
             mask = setup.occlusion.unoccluded_on_device(setup.locations, landmarks)
             wp.synchronize_device(device)
             return mask
@@ -188,7 +183,7 @@ def paper_size(args: argparse.Namespace, device: str) -> list[dict[str, Any]]:
     return rows
 
 
-def scaling(args: argparse.Namespace, device: str) -> list[dict[str, Any]]:
+def scaling(args, device):
     """Measure how time and memory grow along each axis of `SCALING`, up to `--scaling-limit` of each."""
     axes = {axis: [value for value in values if value <= args.scaling_limit] for axis, values in SCALING.items()}
     base = {axis: min(value, max(axes[axis])) for axis, value in BASE.items()}
@@ -216,7 +211,7 @@ def scaling(args: argparse.Namespace, device: str) -> list[dict[str, Any]]:
     return rows
 
 
-def bounded(args: argparse.Namespace, device: str) -> list[dict[str, Any]]:
+def bounded(args, device):
     """Run 2 million landmarks x 5,000 locations within a memory bound; return its time and peak memory."""
     setup = Setup(args, device, 2_000_000, 5_000)
     rotations = rotation_looking_along(fibonacci_sphere(args.directions))
@@ -237,7 +232,7 @@ def bounded(args: argparse.Namespace, device: str) -> list[dict[str, Any]]:
     return [row]
 
 
-def draw(args: argparse.Namespace) -> None:
+def draw(args):
     """Write tables and figures of earlier results, and log them to MLflow if asked to."""
     tables = [pd.read_csv(file) for file in args.draw if file.endswith(".csv")]
     results = [json.loads(Path(file).read_text()) for file in args.draw if not file.endswith(".csv")]
@@ -258,7 +253,7 @@ def draw(args: argparse.Namespace) -> None:
         log_runtimes(TrackingConfig(), folder)
 
 
-def main() -> None:
+def main():
     """Parse the options and measure, or draw earlier results."""
     args = options(
         __doc__, scene=str, device="cpu", locations=648, directions=500, landmarks=24_919, triangles=250_000,
@@ -269,7 +264,7 @@ def main() -> None:
         draw(args)
         return
     device = start_warp(args.device)
-    result: dict[str, Any] = {"machine": machine(device), "paper_size": paper_size(args, device)}
+    result = {"machine": machine(device), "paper_size": paper_size(args, device)}
     if args.scaling:
         result["scaling"] = scaling(args, device)
     if args.bounded:

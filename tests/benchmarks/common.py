@@ -4,20 +4,17 @@ from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
-import pandas as pd
 import pycolmap
 import torch
 
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.mesh import TexturedMesh
-from wheretolook.geometry.poses import Float, poses_looking_along
+from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.scenes.config import ApartmentConfig
@@ -31,7 +28,7 @@ SIDE_M = 20.0  # of the building of `write_model`
 HEIGHT_M = 3.0
 
 
-def options(about: str | None, **defaults: Any) -> argparse.Namespace:
+def options(about, **defaults):
     """Parse the command line: `...` is a required path, a type an optional value, a list several values, False a flag."""
     parser = argparse.ArgumentParser(description=about, formatter_class=argparse.RawDescriptionHelpFormatter)
     for name, default in defaults.items():
@@ -49,9 +46,7 @@ def options(about: str | None, **defaults: Any) -> argparse.Namespace:
     return parser.parse_args()
 
 
-def seconds_of(
-    work: Callable[[], object], repeats: int, clock: Callable[[], float] = time.perf_counter
-) -> dict[str, float]:
+def seconds_of(work, repeats, clock=time.perf_counter):
     """Return median, quartiles, minimum and maximum seconds over repeats, after one warm-up run."""
     work()
     seconds = []
@@ -63,27 +58,25 @@ def seconds_of(
     return {"median_s": median, "q1_s": first, "q3_s": third, "min_s": low, "max_s": high, "repeats": repeats}
 
 
-def show(label: str, times: dict[str, float], about: str = "") -> None:
+def show(label, times, about=""):
     """Print median, quartiles and range of `seconds_of` in milliseconds."""
     median, first, third, low, high = (1e3 * times[f"{name}_s"] for name in ("median", "q1", "q3", "min", "max"))
     print(f"{label:62} {median:12,.3f} ms, quartiles [{first:,.3f}, {third:,.3f}], range [{low:,.3f}, {high:,.3f}] {about}",
           flush=True)  # fmt: skip
 
 
-def timed(
-    label: str, work: Callable[[], object], repeats: int, each: int = 1, clock: Callable[[], float] = time.perf_counter
-) -> float:
+def timed(label, work, repeats, each=1, clock=time.perf_counter):
     """Print the times of one of `each` pieces of work; return their median in seconds."""
     times = {name: value / each for name, value in seconds_of(work, repeats, clock).items()}
     show(label, times)
     return times["median_s"]
 
 
-def write_csv(table: pd.DataFrame, path: Path) -> None:
+def write_csv(table, path):
     table.to_csv(path, index=False, float_format="%.6g", lineterminator="\n")
 
 
-def room_landmarks(n: int, seed: int = 0) -> Float:
+def room_landmarks(n, seed=0):
     """Return points (n, 3) m on the walls, floor and ceiling of one room."""
     rng = np.random.default_rng(seed)
     points = rng.uniform(*ROOM_M, (n, 3))
@@ -92,14 +85,14 @@ def room_landmarks(n: int, seed: int = 0) -> Float:
     return points
 
 
-def room_map(n_landmarks: int, locations: Float, device: str) -> LocalizationMap:
+def room_map(n_landmarks, locations, device):
     """Return a map of room landmarks with random attributes; half of them are occluded from each location (L, 3) m."""
     rng = np.random.default_rng(0)
     points = room_landmarks(n_landmarks)
     offsets = points - np.mean(ROOM_M, axis=0)
     distance = np.linalg.norm(offsets, axis=1)
 
-    def uniform(low: float, high: float) -> np.ndarray:
+    def uniform(low, high):
         return rng.uniform(low, high, n_landmarks).astype(np.float32)
 
     landmarks = Landmarks(
@@ -119,7 +112,7 @@ def room_map(n_landmarks: int, locations: Float, device: str) -> LocalizationMap
     return LocalizationMap(landmarks, PinholeCamera(), occlusion, device)
 
 
-def points_on_surface(mesh: TexturedMesh, n: int, rng: np.random.Generator) -> Float:
+def points_on_surface(mesh, n, rng):
     """Return points (n, 3) m spread over a mesh by area, with 5 mm noise."""
     a, b, c = np.moveaxis(mesh.vertices[mesh.triangles].astype(np.float64), 1, 0)
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
@@ -129,7 +122,7 @@ def points_on_surface(mesh: TexturedMesh, n: int, rng: np.random.Generator) -> F
     return on_triangle + rng.normal(scale=0.005, size=(n, 3))
 
 
-def free_points(space: FreeSpace, bounds: Float, n: int, rng: np.random.Generator) -> Float:
+def free_points(space, bounds, n, rng):
     """Return n points (n, 3) m drawn uniformly from free space within bounds (2, 3) m."""
     found = np.empty((0, 3))
     while len(found) < n:
@@ -147,7 +140,7 @@ class Scene:
     free_space: FreeSpace
 
 
-def open_scene(source: Path | None, folder: Path, seed: int, device: str) -> Scene:
+def open_scene(source, folder, seed, device):
     """Read a mesh file, or `mesh.glb` of a folder; without a source, generate an apartment into `folder`."""
     if source is None:
         source = folder / "mesh.glb"
@@ -158,7 +151,7 @@ def open_scene(source: Path | None, folder: Path, seed: int, device: str) -> Sce
     return Scene(source, mesh, FreeSpace(mesh, device=device))
 
 
-def write_model(folder: Path, n: int) -> None:
+def write_model(folder, n):
     """Write a COLMAP model of n landmarks on the walls of a building of rooms, seen by 200 images of a pinhole."""
     rng = np.random.default_rng(0)
     points = rng.uniform((0, 0, 0), (SIDE_M, SIDE_M, HEIGHT_M), (n, 3))
@@ -187,16 +180,16 @@ def write_model(folder: Path, n: int) -> None:
     model.write(str(folder))
 
 
-def waypoints(n: int) -> Float:
+def waypoints(n):
     """Return n points (n, 3) m in the building of `write_model`."""
     return np.random.default_rng(1).uniform((1, 1, 1), (SIDE_M - 1, SIDE_M - 1, 2), (n, 3))
 
 
-def write_waypoints(n: int, path: Path) -> None:
+def write_waypoints(n, path):
     np.savetxt(path, waypoints(n), delimiter=",", header="x,y,z", comments="")
 
 
-def use_one_thread() -> None:
+def use_one_thread():
     """Limit OpenCV and PyTorch to one thread, as in a labelling worker."""
     cv2.setNumThreads(1)
     torch.set_num_threads(1)

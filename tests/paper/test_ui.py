@@ -1,13 +1,10 @@
 """`wheretolook ui`: links to comparisons, and MLflow's server without its assistant."""
 
-from __future__ import annotations
-
 import signal
 import socket
 import subprocess
 import sys
 from http.client import HTTPConnection
-from pathlib import Path
 
 import pytest
 
@@ -18,11 +15,11 @@ from wheretolook_paper.commands.ui import Ui, comparisons
 
 
 @pytest.fixture
-def tracking(tmp_path: Path) -> TrackingConfig:
+def tracking(tmp_path):
     return TrackingConfig(str(tmp_path / "mlruns"))
 
 
-def test_evaluations_are_compared_first(tracking: TrackingConfig) -> None:
+def test_evaluations_are_compared_first(tracking):
     with pytest.raises(MissingRunError):
         comparisons(tracking, "")
     assert not tracking.root.exists()
@@ -36,13 +33,13 @@ def test_evaluations_are_compared_first(tracking: TrackingConfig) -> None:
     assert links["house: evaluation"] == f"http://server/#/experiments/{ids['evaluate']}/runs?{view}"
 
 
-def test_a_port_in_use() -> None:
+def test_a_port_in_use():
     with socket.create_server(("127.0.0.1", 0)) as taken, pytest.raises(InUseError):
         Ui(port=taken.getsockname()[1]).run()
 
 
 @pytest.mark.slow
-def test_the_server_has_no_assistant_and_ends_when_interrupted(tracking: TrackingConfig) -> None:
+def test_the_server_has_no_assistant_and_ends_when_interrupted(tracking):
     experiment_id(client(tracking), tracking, "evaluate", "house")
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]

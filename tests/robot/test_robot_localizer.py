@@ -7,7 +7,6 @@ import shutil
 import subprocess
 import sys
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -22,7 +21,7 @@ from wheretolook.features.matches import match
 from wheretolook.features.matching import DescriptorMatcher
 from wheretolook.features.sift import OpenCvSift
 from wheretolook.geometry.lattices import direction_lattice
-from wheretolook.geometry.poses import Float, camera_centers, pose_error, poses_looking_along, transform
+from wheretolook.geometry.poses import camera_centers, pose_error, poses_looking_along, transform
 from wheretolook.geometry.similarity import Similarity, local_origin
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.localization.config import LocalizerConfig
@@ -62,18 +61,18 @@ class ByPose:
 
     scorer: Scorer
 
-    def score_directions(self, locations: Float, directions: Float) -> Float:
+    def score_directions(self, locations, directions):
         return Scorer.score_directions(self.scorer, locations, directions)
 
 
-def described() -> Landmarks:
+def described():
     rng = np.random.default_rng(0)
     unit = rng.exponential(size=(1200, 128))
     unit /= np.linalg.norm(unit, axis=1, keepdims=True)
     return replace(make_landmarks(rng, 1200), descriptors=np.round(512 * unit).clip(0, 255).astype(np.uint8))
 
 
-def view_of(landmarks: Landmarks, pose: Float) -> tuple[np.ndarray, np.ndarray]:
+def view_of(landmarks, pose):
     """Keypoints at the landmarks of a view, with half a pixel of noise."""
     rng = np.random.default_rng(1)
     in_camera = transform(pose, landmarks.points)
@@ -85,14 +84,14 @@ def view_of(landmarks: Landmarks, pose: Float) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory):
     out = tmp_path_factory.mktemp("robot")
     source = LocalizationMap(described(), CAMERA)
     export_localizer(described(), described().ids, mean_scores_by_pitch(load_scorer(source), PLACES), out)
     return export_robot(source, BUNDLED, out)
 
 
-def test_poses_are_those_of_the_localizer(folder: Path) -> None:
+def test_poses_are_those_of_the_localizer(folder):
     landmarks = described()
     robot = RobotLocalizer(folder)
     matcher = DescriptorMatcher(landmarks.descriptors)
@@ -112,7 +111,7 @@ def test_poses_are_those_of_the_localizer(folder: Path) -> None:
     assert rig.probability == rig.poses[0].probability > 0.9
 
 
-def test_the_next_look_is_that_of_the_selector(folder: Path) -> None:
+def test_the_next_look_is_that_of_the_selector(folder):
     scorer = load_scorer(LocalizationMap(described(), CAMERA))
     selector = NextLookSelector(ByPose(scorer), mean_scores_by_pitch(scorer, PLACES))
     localizer = RobotLocalizer(folder)
@@ -131,7 +130,7 @@ def test_the_next_look_is_that_of_the_selector(folder: Path) -> None:
             assert chosen.gain == pytest.approx(expected.gain, abs=1e-5)
 
 
-def test_a_prior_adds_the_pose_that_ambiguous_matches_hide(tmp_path: Path) -> None:
+def test_a_prior_adds_the_pose_that_ambiguous_matches_hide(tmp_path):
     """Of a map that repeats 30 m away with the same descriptors, Lowe's ratio leaves no match without a prior."""
     one = described()
     columns = {name: np.concatenate([v, v]) for name, v in vars(one).items() if isinstance(v, np.ndarray)}
@@ -147,7 +146,7 @@ def test_a_prior_adds_the_pose_that_ambiguous_matches_hide(tmp_path: Path) -> No
         np.testing.assert_allclose(center, (x, 0.3, 1.2), atol=0.05)
 
 
-def test_the_folder_runs_by_itself(folder: Path) -> None:
+def test_the_folder_runs_by_itself(folder):
     pixels, descriptors = view_of(described(), POSES[0])
     np.savez(folder / "views.npz", pixels=pixels, descriptors=descriptors)
     subprocess.run([sys.executable, "-c", RUN], cwd=folder, check=True)
@@ -158,7 +157,7 @@ def test_the_folder_runs_by_itself(folder: Path) -> None:
     np.testing.assert_allclose(np.load(folder / "next.npy"), chosen.cam_from_rig, atol=1e-9)
 
 
-def test_keypoints_are_those_of_the_extractor(folder: Path) -> None:
+def test_keypoints_are_those_of_the_extractor(folder):
     rng = np.random.default_rng(0)
     grey = cv2.GaussianBlur(rng.integers(0, 256, (CAMERA.height, CAMERA.width), np.uint8), (0, 0), 3)
     grey = cv2.normalize(grey, None, 0, 255, cv2.NORM_MINMAX)
@@ -171,7 +170,7 @@ def test_keypoints_are_those_of_the_extractor(folder: Path) -> None:
     np.testing.assert_allclose(RobotLocalizer(folder).extract(double)[0], 2 * pixels, atol=1e-3)
 
 
-def test_poses_are_in_the_frame_of_the_map(tmp_path: Path) -> None:
+def test_poses_are_in_the_frame_of_the_map(tmp_path):
     landmarks = described()
     frame = Similarity(2.0, np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), np.array([1.0, 2.0, 3.0]))
     export_localizer(landmarks, landmarks.ids, np.zeros(N_DIRECTIONS), tmp_path)
@@ -188,9 +187,7 @@ def test_poses_are_in_the_frame_of_the_map(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("error_deg", "max_views"), [(0.0, 2), (5.0, 2), (0.0, 1)])
-def test_odometry_whose_rotation_the_images_contradict_is_reported(
-    folder: Path, error_deg: float, max_views: int
-) -> None:
+def test_odometry_whose_rotation_the_images_contradict_is_reported(folder, error_deg, max_views):
     """A confidence that no image reaches keeps all views in the rig, at most `max_views`."""
     robot = RobotLocalizer(folder)
     sequence = ImageSequence(robot, max_views=max_views)
@@ -204,7 +201,7 @@ def test_odometry_whose_rotation_the_images_contradict_is_reported(
     assert second.localization.status == ("contradicted" if error_deg else "localized")
 
 
-def test_invalid_input_is_rejected(folder: Path, tmp_path: Path) -> None:
+def test_invalid_input_is_rejected(folder, tmp_path):
     robot = RobotLocalizer(folder)
     view = view_of(described(), POSES[0])
     nothing = robot.localize([robot.match(np.zeros((0, 2)), np.zeros((0, 128), np.uint8))])
@@ -242,7 +239,7 @@ def test_invalid_input_is_rejected(folder: Path, tmp_path: Path) -> None:
         export_localizer(replace(described(), descriptors=None), described().ids, np.zeros(N_DIRECTIONS), tmp_path)
 
 
-def test_a_folder_of_another_version_is_rejected(folder: Path, tmp_path: Path) -> None:
+def test_a_folder_of_another_version_is_rejected(folder, tmp_path):
     old = shutil.copytree(folder, tmp_path / "old")
     (old / "mean_scores.npy").unlink()
     robot = RobotLocalizer(old)

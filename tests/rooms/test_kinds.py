@@ -1,9 +1,6 @@
 """Halls, courts, offices and buildings: drawn from their seeds, closed, and copies where they are to be copies."""
 
-from __future__ import annotations
-
 from functools import cache
-from pathlib import Path
 from typing import get_args
 
 import numpy as np
@@ -14,9 +11,8 @@ from wheretolook.dataset.layout import SceneFolder
 from wheretolook.scenes.config import ApartmentConfig, SceneKind
 from wheretolook.space.free_space import FreeSpace
 from wheretolook.utils.errors import ConfigError
-from wheretolook_rooms.building import MAX_DIFFERENCE, Copy, Module, draw_building
+from wheretolook_rooms.building import MAX_DIFFERENCE, draw_building
 from wheretolook_rooms.generator import generate_scene
-from wheretolook_rooms.large import Furnished
 from wheretolook_rooms.patches import join
 
 FAST = ApartmentConfig(texels_per_m=20, texture_size=2048, light_rays=4, light_spacing_m=1.0)
@@ -25,7 +21,7 @@ SLOW = pytest.mark.slow
 
 
 @pytest.mark.parametrize("kind", [pytest.param(kind, marks=[] if kind == "building" else SLOW) for kind in KINDS])
-def test_mesh_is_well_formed_and_follows_from_the_seed(kind: SceneKind) -> None:
+def test_mesh_is_well_formed_and_follows_from_the_seed(kind):
     mesh, mapped = generate_scene(kind, FAST, 4)
     again, mapped_again = generate_scene(kind, FAST, 4)
     for name in ("vertices", "triangles", "corner_uvs", "triangle_texture"):
@@ -51,12 +47,12 @@ def test_mesh_is_well_formed_and_follows_from_the_seed(kind: SceneKind) -> None:
 
 
 @cache
-def drawn_building(seed: int) -> tuple[Furnished, Module, list[Copy]]:
+def drawn_building(seed):
     return draw_building(ApartmentConfig(clutter=0.3), seed)
 
 
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=SLOW) for seed in (1, 2, 3))])
-def test_copies_of_a_building_are_copies(seed: int) -> None:
+def test_copies_of_a_building_are_copies(seed):
     furnished, module, copies = drawn_building(seed)
     assert 2 <= len(copies) <= 8 and 1 <= sum(copy.mapped for copy in copies) <= len(copies)
     assert len(furnished.mapped) == 1 + sum(copy.mapped for copy in copies)  # the corridor beside them
@@ -78,17 +74,17 @@ def test_copies_of_a_building_are_copies(seed: int) -> None:
             assert min(x1, a1) <= max(x0, a0) or min(y1, b1) <= max(y0, b0)
 
 
-def test_kinds_take_turns() -> None:
+def test_kinds_take_turns():
     scenes = ScenesConfig(kinds=("apartment", "hall", "court"))
     assert [scenes.kind_of(seed) for seed in range(3, 8)] == ["apartment", "hall", "court", "apartment", "hall"]
     assert ScenesConfig().kind_of(7) == "apartment"
     with pytest.raises(ConfigError):
         ScenesConfig(kinds=())
     with pytest.raises(ConfigError):
-        ScenesConfig(kinds=("castle",))  # type: ignore[arg-type]
+        ScenesConfig(kinds=("castle",))
 
 
-def test_mapped_floor_is_stored_with_the_mesh(tmp_path: Path) -> None:
+def test_mapped_floor_is_stored_with_the_mesh(tmp_path):
     scene = SceneFolder(tmp_path / "building-001", "train")
     floor = ((0.0, 0.0, 2.5, 1.0), (3.0, 0.0, 4.0, 1.0))
     assert scene.mapped_floor() == ()

@@ -1,14 +1,9 @@
 """The procedural apartment: closed, reachable, deterministic, and both plain and rich in texture."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
 from functools import cache
-from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy import ndimage
 
 from wheretolook.scenes.config import ApartmentConfig
@@ -17,7 +12,7 @@ from wheretolook_rooms import decor, fixtures, furniture
 from wheretolook_rooms import patches as patches_module
 from wheretolook_rooms.generator import furnish_apartment
 from wheretolook_rooms.materials import plain
-from wheretolook_rooms.plan import Plan, draw_plan
+from wheretolook_rooms.plan import draw_plan
 from wheretolook_rooms.style import Style
 
 SEEDS = (0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2)))
@@ -25,12 +20,12 @@ CONFIG = ApartmentConfig()
 
 
 @cache
-def furnished(seed: int) -> tuple[Plan, patches_module.Surface]:
+def furnished(seed):
     plan, patches, _, _ = furnish_apartment(CONFIG, seed)
     return plan, patches_module.join(patches)
 
 
-def _raycasting_scene(surface: patches_module.Surface) -> Any:
+def _raycasting_scene(surface):
     import open3d as o3d
 
     scene = o3d.t.geometry.RaycastingScene()
@@ -40,7 +35,7 @@ def _raycasting_scene(surface: patches_module.Surface) -> Any:
     return scene
 
 
-def _cast(scene: Any, origins: NDArray[Any], directions: NDArray[Any]) -> dict[str, NDArray[Any]]:
+def _cast(scene, origins, directions):
     import open3d as o3d
 
     rays = np.concatenate(np.broadcast_arrays(origins, directions), -1).astype(np.float32)
@@ -48,7 +43,7 @@ def _cast(scene: Any, origins: NDArray[Any], directions: NDArray[Any]) -> dict[s
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_shell_is_closed(seed: int) -> None:
+def test_shell_is_closed(seed):
     plan, surface = furnished(seed)
     scene = _raycasting_scene(surface)
     directions = np.random.default_rng(seed).normal(size=(20_000, 3))
@@ -66,7 +61,7 @@ def test_shell_is_closed(seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_every_room_is_reached_on_foot(seed: int) -> None:
+def test_every_room_is_reached_on_foot(seed):
     """Flood fill over the floor: where nothing stands between 0.05 m and 1.9 m, shrunk by a walker of 0.4 m width."""
     plan, surface = furnished(seed)
     scene = _raycasting_scene(surface)
@@ -85,7 +80,7 @@ def test_every_room_is_reached_on_foot(seed: int) -> None:
         assert (labels[inside] == main).sum() * step**2 > 0.5, f"{room.kind} cannot be entered"
 
 
-FURNITURE: dict[str, Callable[[Style], list[patches_module.Patch]]] = {
+FURNITURE = {
     "sofa": lambda s: furniture.sofa(s, 3),
     "bed": lambda s: furniture.bed(s, 1.6),
     "chair": lambda s: furniture.chair(s, s.wood, s.upholstery),
@@ -97,7 +92,7 @@ FURNITURE: dict[str, Callable[[Style], list[patches_module.Patch]]] = {
 
 
 @pytest.mark.parametrize("name", FURNITURE)
-def test_furniture_is_closed_and_faces_outward(name: str) -> None:
+def test_furniture_is_closed_and_faces_outward(name):
     """With equal points merged, each directed edge occurs as often as its reverse; rays from outside meet a front."""
     surface = patches_module.join(FURNITURE[name](Style(np.random.default_rng(3), 0.5, 0.5)))
     _, point = np.unique(np.floor(surface.vertices * 1e6 + 0.33), axis=0, return_inverse=True)
@@ -123,11 +118,11 @@ def test_furniture_is_closed_and_faces_outward(name: str) -> None:
     assert front[struck].mean() > 0.999
 
 
-def test_closed_primitives_enclose_their_volume() -> None:
+def test_closed_primitives_enclose_their_volume():
     """Divergence theorem: the signed volume of a closed outward-facing surface is that of the solid."""
     paint = plain(np.random.default_rng(0), (0.5, 0.5, 0.5))
 
-    def volume(patches: list[patches_module.Patch]) -> float:
+    def volume(patches):
         surface = patches_module.join(patches)
         a, b, c = (surface.vertices[surface.triangles[:, k]] for k in range(3))
         return float((a * np.cross(b, c)).sum() / 6)
@@ -146,7 +141,7 @@ def test_closed_primitives_enclose_their_volume() -> None:
     assert volume(sheet) == pytest.approx(0.1)
 
 
-def test_plans_are_sound() -> None:
+def test_plans_are_sound():
     for seed in range(30):
         n_rooms = 3 + seed % 4
         plan = draw_plan(np.random.default_rng(seed), n_rooms, 13.0 * n_rooms, 0.5)
@@ -163,7 +158,7 @@ def test_plans_are_sound() -> None:
                 assert min(a.x1, b.x1) <= max(a.x0, b.x0) or min(a.y1, b.y1) <= max(a.y0, b.y0)
 
 
-def test_apartments_of_before_keep_their_key() -> None:
+def test_apartments_of_before_keep_their_key():
     before = {
         "n_rooms": None, "area_m2": None, "texture_richness": 0.85, "clutter": 0.85, "dark_rooms": 0.2,
         "texels_per_m": 125.0, "texture_size": 4096, "light_spacing_m": 0.1, "light_rays": 24,
@@ -176,6 +171,6 @@ def test_apartments_of_before_keep_their_key() -> None:
     "options",
     [{"n_rooms": 2}, {"repetition": -0.1}, {"enlarged": 0.0}, {"clutter": 1.5}, {"area_m2": 5.0}, {"light_rays": 0}],
 )
-def test_invalid_options_are_rejected(options: dict[str, float]) -> None:
+def test_invalid_options_are_rejected(options):
     with pytest.raises(ConfigError):
-        ApartmentConfig(**options)  # type: ignore[arg-type]
+        ApartmentConfig(**options)

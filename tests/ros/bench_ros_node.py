@@ -7,8 +7,6 @@ Times are CPU times of the node's process, whatever else runs on the machine. Wi
 every tenth is black, and the node publishes next views, so that all it does can keep memory.
 """
 
-from __future__ import annotations
-
 import os
 import sys
 import time
@@ -33,24 +31,24 @@ from wheretolook.scenes.loading import load_mesh
 TICKS = os.sysconf("SC_CLK_TCK")
 
 
-def cpu_seconds(pid: int) -> float:
+def cpu_seconds(pid):
     """CPU time of all threads of a process."""
     fields = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
     return (int(fields[11]) + int(fields[12])) / TICKS
 
 
-def resident_mb(pid: int) -> float:
+def resident_mb(pid):
     """Resident memory of a process."""
     return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
 
 
-def seconds_of_images(node: Robot) -> list[float]:
+def seconds_of_images(node):
     """Seconds that each localized image took, by the diagnostics received."""
     reports = [message.status[0].values for name, message in node.received if name == "/diagnostics"]
     return [float(pair.value) for values in reports for pair in values if pair.key == "seconds" and len(values) > 1]
 
 
-def main() -> None:
+def main():
     """Measure and print."""
     options = parse_options(__doc__, mesh=..., folder=..., seconds=180.0, views=40, rate=0.0)
     os.environ.update(environment())
@@ -69,7 +67,7 @@ def main() -> None:
         started = time.monotonic() - began
         print(f"first image localized {started:.1f} s after the start, {cpu_seconds(process.pid):.1f} s of CPU time")
         node.received.clear()
-        times: list[float] = []
+        times = []
         begin = time.monotonic()
         cpu = cpu_seconds(process.pid)
         number = 0

@@ -8,8 +8,6 @@ planning (`wheretolook_robot.RobotScorer`, `best_sequence`). Prints the share of
 the right ones.
 """
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 
@@ -24,7 +22,7 @@ from common import write_csv
 
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.camera_turns import pan_tilt_angles
-from wheretolook.geometry.poses import Float, pose_error, poses_looking_along
+from wheretolook.geometry.poses import pose_error, poses_looking_along
 from wheretolook.planning.config import PathConfig
 from wheretolook.planning.rrt import plan_path
 from wheretolook.planning.view_sequence import TurnLimit, best_sequence
@@ -42,7 +40,7 @@ MAX_TILT_DEG = 45.0
 MAX_TURN_DEG = 60.0
 
 
-def waypoints_of(places: Float, space: FreeSpace, min_length_m: float, rng: np.random.Generator) -> Float:
+def waypoints_of(places, space, min_length_m, rng):
     """Plan a shortest path between two random places (L, 3) m apart, and return points (W, 3) every `SPACING_M`."""
     bounds = np.stack([places.min(0), places.max(0)])
     while True:
@@ -59,7 +57,7 @@ def waypoints_of(places: Float, space: FreeSpace, min_length_m: float, rng: np.r
         return np.stack([np.interp(at, along, values) for values in path.positions.T], axis=1)
 
 
-def main() -> None:
+def main():
     args = parse_options(__doc__, mesh=..., folder=..., paths=20, min_length=3.0, seed=0, out=Path("paths.csv"))
     mesh = load_mesh(args.mesh)
     space = FreeSpace(mesh)

@@ -1,12 +1,8 @@
 """The nodes under ROS, in processes of their own: frames, stamps, covariance, and all bad input."""
 
-from __future__ import annotations
-
 import json
 import os
 import time
-from collections.abc import Iterator
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -18,8 +14,8 @@ import rclpy
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry
-from sensor_msgs.msg import CompressedImage, Image, JointState, RegionOfInterest
-from wheretolook_ros.conversions import Array, grey_image, pose_matrix, pose_message
+from sensor_msgs.msg import CompressedImage, JointState, RegionOfInterest
+from wheretolook_ros.conversions import grey_image, pose_matrix, pose_message
 
 from ros.processes import CAMERA, HEAD, JOINTS, Robot, base_at, environment, image_of, info_of, jpeg_of, mosaic, running
 from ros.room import room_mesh, write_folder
@@ -36,12 +32,12 @@ ERROR = DiagnosticStatus.ERROR
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory):
     return write_folder(room_mesh(), tmp_path_factory.mktemp("room"))
 
 
 @pytest.fixture(scope="module")
-def context() -> Iterator[None]:
+def context():
     os.environ.update(environment())
     rclpy.init()
     yield
@@ -49,7 +45,7 @@ def context() -> Iterator[None]:
 
 
 @pytest.fixture(scope="module")
-def robot(context: None, folder: Path) -> Iterator[Robot]:
+def robot(context, folder):
     """A robot whose images a localizer in another process localizes."""
     node = Robot(WarpRenderer(room_mesh()))
     with running(LOCALIZER, {"folder": folder}):
@@ -61,31 +57,31 @@ def robot(context: None, folder: Path) -> Iterator[Robot]:
     node.destroy_node()
 
 
-def image_of_16_bits(values: Array) -> Image:
+def image_of_16_bits(values):
     """A mono16 image with values (H, W)."""
     image = image_of(values.view(np.uint8).reshape(*values.shape, 2), "mono16")
     image.is_bigendian = int(values.dtype.byteorder == ">")
     return image
 
 
-def pose_of(robot: Robot) -> Array:
+def pose_of(robot):
     """The published pose of the base in the map."""
     return pose_matrix(robot.last("visual_localization/pose").pose.pose)
 
 
-def assert_right(robot: Robot, base: Array, error_m: float = 0.02, error_deg: float = 0.3) -> None:
+def assert_right(robot, base, error_m=0.02, error_deg=0.3):
     found = robot.wait(lambda: robot.last("visual_localization/pose"), "a pose")
     position, angle = pose_error(invert_poses(pose_matrix(found.pose.pose)), invert_poses(base))
     assert position < error_m and angle < error_deg, (position, angle)
 
 
-def localizes_again(robot: Robot) -> None:
+def localizes_again(robot):
     """The node still runs: the next image, with a good camera, is localized."""
     assert robot.see(image_of(robot.rgb(BASE)), info_of(CAMERA)).message == "localized"
     assert_right(robot, BASE)
 
 
-def test_frame_stamp_and_covariance(robot: Robot) -> None:
+def test_frame_stamp_and_covariance(robot):
     errors = []
     for number, yaw in enumerate((0.0, 100.0, 200.0)):
         base = base_at(2.6 + 0.3 * number, 2.3, yaw)
@@ -107,7 +103,7 @@ def test_frame_stamp_and_covariance(robot: Robot) -> None:
 @pytest.mark.parametrize(
     "encoding", ["bgr8", "rgba8", "mono8", "mono16", "mono16 of 12 bits", "bayer_rggb8", "bayer_gbrg8", "compressed"]
 )
-def test_encodings(robot: Robot, encoding: str) -> None:
+def test_encodings(robot, encoding):
     rgb = robot.rgb(BASE)
     grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
     images = {
@@ -124,7 +120,7 @@ def test_encodings(robot: Robot, encoding: str) -> None:
     assert_right(robot, BASE)
 
 
-def test_compressed_images_of_12_bits_are_scaled_as_others() -> None:
+def test_compressed_images_of_12_bits_are_scaled_as_others():
     grey = np.random.default_rng(0).integers(0, 255, (48, 64), dtype=np.uint8)
     grey[0, 0] = 255
     png = cv2.imencode(".png", grey.astype(np.uint16) * 16 + 7)[1].tobytes()
@@ -132,7 +128,7 @@ def test_compressed_images_of_12_bits_are_scaled_as_others() -> None:
     assert np.abs(scaled.astype(int) - grey).max() <= 1
 
 
-def test_16_bits_are_shifted_by_the_brightest_pixel() -> None:
+def test_16_bits_are_shifted_by_the_brightest_pixel():
     """No field of an Image states how many of its 16 bits a camera uses; a black image stays black."""
     grey = np.random.default_rng(0).integers(0, 250, (480, 640), dtype=np.uint8)
     grey[0, 0] = 255
@@ -144,13 +140,13 @@ def test_16_bits_are_shifted_by_the_brightest_pixel() -> None:
 
 
 @pytest.mark.parametrize("size", [(320, 240), (1280, 960)])
-def test_another_resolution(robot: Robot, size: tuple[int, int]) -> None:
+def test_another_resolution(robot, size):
     camera = PinholeCamera(*size, size[0] / 2)
     assert robot.see(image_of(robot.rgb(BASE, camera=camera)), info_of(camera)).message == "localized"
     assert_right(robot, BASE)
 
 
-def test_distortion_is_removed(robot: Robot) -> None:
+def test_distortion_is_removed(robot):
     """An image with barrel distortion, warped from a wider pinhole."""
     wide = PinholeCamera(1280, 960, 320.0)
     info = info_of(CAMERA)
@@ -164,7 +160,7 @@ def test_distortion_is_removed(robot: Robot) -> None:
     assert_right(robot, BASE)
 
 
-def test_a_dark_image_is_lost_and_a_next_view_is_published(robot: Robot) -> None:
+def test_a_dark_image_is_lost_and_a_next_view_is_published(robot):
     status = robot.see(image_of(np.zeros((480, 640, 3), np.uint8)), info_of(CAMERA), joints=(0.5, 0.0))
     assert status.level == WARN and status.message == "lost: no pose from 0 matches with the map"
     assert robot.last("visual_localization/pose") is None
@@ -176,7 +172,7 @@ def test_a_dark_image_is_lost_and_a_next_view_is_published(robot: Robot) -> None
     localizes_again(robot)
 
 
-def test_odometry_makes_a_rig_of_ambiguous_views(robot: Robot) -> None:
+def test_odometry_makes_a_rig_of_ambiguous_views(robot):
     """Through a small window each view alone is not confident; together they are."""
     base = base_at(3.2, 2.4, 75.0)
     alone = []
@@ -194,7 +190,7 @@ def test_odometry_makes_a_rig_of_ambiguous_views(robot: Robot) -> None:
     assert_right(robot, base, 0.05, 0.4)
 
 
-def test_a_prior_does_no_harm_and_one_of_another_frame_is_reported(robot: Robot) -> None:
+def test_a_prior_does_no_harm_and_one_of_another_frame_is_reported(robot):
     prior = PoseWithCovarianceStamped()
     prior.header.frame_id = "odom"
     prior.pose.pose.orientation.w = 1.0
@@ -222,7 +218,7 @@ def test_a_prior_does_no_harm_and_one_of_another_frame_is_reported(robot: Robot)
         ({"data": b"\0" * 1000}, "1000 bytes of data do not fit an image of 640 x 480 px rgb8, step 1924"),
     ],
 )
-def test_an_image_that_cannot_be_read(robot: Robot, change: dict[str, object], message: str) -> None:
+def test_an_image_that_cannot_be_read(robot, change, message):
     image = image_of(robot.rgb(BASE))
     for name, value in change.items():
         setattr(image, name, value)
@@ -245,7 +241,7 @@ def test_an_image_that_cannot_be_read(robot: Robot, change: dict[str, object], m
         ({"k": [1e-9, 0.0, 0.0, 0.0, 1e-9, 0.0, 0.0, 0.0, 1.0]}, "focal length"),
     ],
 )
-def test_a_camera_that_cannot_be_used(robot: Robot, change: dict[str, object], message: str) -> None:
+def test_a_camera_that_cannot_be_used(robot, change, message):
     info = info_of(CAMERA)
     for name, value in change.items():
         setattr(info, name, value)
@@ -254,13 +250,13 @@ def test_a_camera_that_cannot_be_used(robot: Robot, change: dict[str, object], m
     localizes_again(robot)
 
 
-def test_a_region_of_interest_of_the_whole_image_is_none(robot: Robot) -> None:
+def test_a_region_of_interest_of_the_whole_image_is_none(robot):
     info = info_of(CAMERA)
     info.roi = RegionOfInterest(width=640, height=480)
     assert robot.see(image_of(robot.rgb(BASE)), info).message == "localized"
 
 
-def test_a_head_whose_joint_states_are_missing(robot: Robot) -> None:
+def test_a_head_whose_joint_states_are_missing(robot):
     """Without them the pose of the base would be wrong by the pan."""
     robot.stamp += 10.0
     robot.received.clear()
@@ -269,7 +265,7 @@ def test_a_head_whose_joint_states_are_missing(robot: Robot) -> None:
     assert robot.last("visual_localization/pose") is None
 
 
-def test_images_are_localized_while_odometry_is_late(robot: Robot) -> None:
+def test_images_are_localized_while_odometry_is_late(robot):
     """Images every 50 ms, each newer than the odometry that has arrived."""
     image = image_of(robot.rgb(BASE))
     robot.see(image, info_of(CAMERA), odometry=base_at(0.0, 0.0, 0.0))
@@ -290,7 +286,7 @@ def test_images_are_localized_while_odometry_is_late(robot: Robot) -> None:
     robot.wait(lambda: image_key in getattr(robot.status(), "values", ()), "the newest image")
 
 
-def test_a_camera_unlike_the_map_s_is_reported(robot: Robot) -> None:
+def test_a_camera_unlike_the_map_s_is_reported(robot):
     camera = PinholeCamera(640, 480, 640.0)
     status = robot.see(image_of(robot.rgb(BASE, camera=camera)), info_of(camera))
     assert (
@@ -300,7 +296,7 @@ def test_a_camera_unlike_the_map_s_is_reported(robot: Robot) -> None:
     assert_right(robot, BASE)
 
 
-def test_time_that_jumps_back(robot: Robot) -> None:
+def test_time_that_jumps_back(robot):
     localizes_again(robot)
     jumped = robot.see(image_of(robot.rgb(BASE)), info_of(CAMERA), step_s=-50.0)
     assert jumped.message == "localized"
@@ -312,7 +308,7 @@ def test_time_that_jumps_back(robot: Robot) -> None:
     localizes_again(robot)
 
 
-def test_odometry_that_contradicts_the_images(robot: Robot) -> None:
+def test_odometry_that_contradicts_the_images(robot):
     still = base_at(0.0, 0.0, 0.0)
     robot.see(image_of(robot.rgb(BASE)), info_of(CAMERA), odometry=still)
     other = base_at(2.4, 3.1, 30.0)

@@ -1,15 +1,11 @@
 """Nodes that are started for one test: the service, folders of another version, the gaze, signals."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -23,7 +19,7 @@ from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, Vector3Sta
 from nav_msgs.msg import Path as PathMessage
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
-from wheretolook_ros.conversions import Array, pose_matrix, pose_message
+from wheretolook_ros.conversions import pose_matrix, pose_message
 from wheretolook_ros.head import Head, Timeline
 
 from ros.processes import CAMERA, HEAD, JOINTS, Robot, base_at, environment, image_of, info_of, running
@@ -38,12 +34,12 @@ GAZE = "wheretolook_ros.gaze"
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory):
     return write_folder(room_mesh(), tmp_path_factory.mktemp("room"))
 
 
 @pytest.fixture(scope="module", autouse=True)
-def context() -> Iterator[None]:
+def context():
     os.environ.update(environment())
     rclpy.init()
     yield
@@ -51,26 +47,26 @@ def context() -> Iterator[None]:
 
 
 @pytest.fixture
-def node() -> Iterator[Robot]:
+def node():
     robot = Robot(WarpRenderer(room_mesh()))
     yield robot
     robot.destroy_node()
 
 
-def within_limits(axes: Array) -> Array:
+def within_limits(axes):
     """Which directions a base along x allows within 60 and 20 degrees."""
     pan = np.degrees(np.arctan2(axes[:, 1], axes[:, 0]))
     tilt = np.degrees(np.arcsin(axes[:, 2]))
     return (np.abs(pan) <= 60) & (np.abs(tilt) <= 20)
 
 
-def test_localizing_on_request(node: Robot, folder: Path) -> None:
+def test_localizing_on_request(node, folder):
     with running(LOCALIZER, {"folder": folder, "enable_continuous_localization": "false"}, signal.SIGINT):
         node.connected("image", "camera_info", "joint_states")
         client = node.create_client(Trigger, "visual_localization/trigger_localization")
         assert client.wait_for_service(30)
 
-        def trigger() -> Trigger.Response:
+        def trigger():
             future = client.call_async(Trigger.Request())
             return node.wait(lambda: future.done() and future.result(), "an answer")
 
@@ -88,7 +84,7 @@ def test_localizing_on_request(node: Robot, folder: Path) -> None:
 
 
 @pytest.mark.parametrize("damage", ["format", "no scores", "missing"])
-def test_a_folder_of_another_version(node: Robot, folder: Path, tmp_path: Path, damage: str) -> None:
+def test_a_folder_of_another_version(node, folder, tmp_path, damage):
     old = tmp_path / "old"
     if damage != "missing":
         shutil.copytree(folder, old)
@@ -133,7 +129,7 @@ def test_a_folder_of_another_version(node: Robot, folder: Path, tmp_path: Path, 
         ("gaze", "use_sim_time:=maybe", "'use_sim_time'"),
     ],
 )
-def test_a_parameter_that_is_not_allowed_ends_the_node(node_name: str, setting: str, message: str) -> None:
+def test_a_parameter_that_is_not_allowed_ends_the_node(node_name, setting, message):
     command = [sys.executable, "-m", f"wheretolook_ros.{node_name}", "--ros-args", "-p", setting]
     ended = subprocess.run(command, env=os.environ | environment(), capture_output=True, text=True, timeout=30)
     assert ended.returncode == 1 and "Traceback" not in ended.stderr, ended.stderr
@@ -141,7 +137,7 @@ def test_a_parameter_that_is_not_allowed_ends_the_node(node_name: str, setting: 
     assert len(lines) == 1 and message in lines[0], ended.stderr
 
 
-def stamp_of(time: float) -> Time:
+def stamp_of(time):
     return Time(sec=int(time), nanosec=round(time % 1 * 1e9))
 
 
@@ -149,9 +145,7 @@ def stamp_of(time: float) -> Time:
     ("limits", "asked", "pan", "within"),
     [((-90, 180), -170, 180, False), ((180, 180), -179, 180, True), ((-180, -170), 100, -180, False)],
 )
-def test_a_head_turns_to_the_nearer_of_its_limits(
-    limits: tuple[float, float], asked: float, pan: float, within: bool
-) -> None:
+def test_a_head_turns_to_the_nearer_of_its_limits(limits, asked, pan, within):
     """Also across 180 degrees: -170 is 10 degrees from 180, and 80 from -90."""
     head = Head([0.0] * 6, limits)
     direction = np.array([np.cos(np.radians(asked)), np.sin(np.radians(asked)), 0])
@@ -159,7 +153,7 @@ def test_a_head_turns_to_the_nearer_of_its_limits(
     assert head.nearest(direction)[1] == within
 
 
-def test_values_are_interpolated_and_never_extrapolated() -> None:
+def test_values_are_interpolated_and_never_extrapolated():
     """A head that turned since its last state would turn the base."""
     line = Timeline()
     assert line.at(0.0) is None
@@ -175,7 +169,7 @@ def test_values_are_interpolated_and_never_extrapolated() -> None:
     assert line.end() == pytest.approx(0.3) and len(line.rows) == 1
 
 
-def test_the_gaze(node: Robot, folder: Path) -> None:
+def test_the_gaze(node, folder):
     scorer = RobotScorer(folder)
     limits = {"pan_limits_deg": "[-60.0, 60.0]", "tilt_limits_deg": "[-20.0, 20.0]"}
     with running(GAZE, {"folder": folder, "directions": 400} | limits):
@@ -240,7 +234,7 @@ PAN_ONLY = {"tilt_joint": '""', "tilt_limits_deg": "[10.0, 40.0]"}  # the camera
 TILT_ONLY = {"pan_joint": '""'}
 
 
-def test_localizing_by_a_head_with_pan_only(node: Robot, folder: Path) -> None:
+def test_localizing_by_a_head_with_pan_only(node, folder):
     with running(LOCALIZER, {"folder": folder} | PAN_ONLY):
         node.connected("image", "camera_info", "joint_states")
         node.joints = ["wheel", "pan"]
@@ -256,7 +250,7 @@ def test_localizing_by_a_head_with_pan_only(node: Robot, folder: Path) -> None:
 
 
 @pytest.mark.parametrize("missing", ["tilt", "pan"])
-def test_the_gaze_of_a_head_with_one_joint(node: Robot, folder: Path, missing: str) -> None:
+def test_the_gaze_of_a_head_with_one_joint(node, folder, missing):
     scorer = RobotScorer(folder)
     with running(GAZE, {"folder": folder} | (PAN_ONLY if missing == "tilt" else TILT_ONLY)):
         node.senders["pose"] = node.create_publisher(PoseWithCovarianceStamped, "visual_localization/pose", 10)

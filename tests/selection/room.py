@@ -1,7 +1,5 @@
 """A small COLMAP model: landmarks on the walls of a room of 6 x 5 x 3 m, seen by twelve images."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 
@@ -14,7 +12,7 @@ WEIGHTS = Path(__file__).parents[2] / "data" / "release" / "weights"
 POINTS = np.array([(1.5, 2.0, 1.5), (2.0, 2.2, 1.4), (2.6, 2.4, 1.5), (3.2, 2.5, 1.6)])
 
 
-def write_room(folder: Path, text: bool = False, n: int = 400, metric: bool = True) -> Path:
+def write_room(folder, text=False, n=400, metric=True):
     rng = np.random.default_rng(0)
     points = rng.uniform((0, 0, 0.2), (6, 5, 2.8), (n, 3))
     wall = rng.integers(0, 2, n)

@@ -1,9 +1,6 @@
 """The views that are selected are the best ones, of all directions, within the limits."""
 
-from __future__ import annotations
-
 from itertools import pairwise, product
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -21,27 +18,26 @@ from wheretolook.io.poses import images_text, tum_text
 from wheretolook.mapping.depth_images import read_depth_images
 from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.scenes.loading import save_glb
-from wheretolook.scorers.base import Scorer
 from wheretolook.select.waypoints import SelectionRequest, read_waypoints
 from wheretolook.select.where_to_look import WhereToLook
-from wheretolook.utils.errors import ConfigError, MapError, SceneError, TableError, WeightsError, WhereToLookError
+from wheretolook.utils.errors import ConfigError, MapError, SceneError, TableError, WeightsError
 from wheretolook.visibility.hidden_points import HiddenPointRemoval
 
 AXES = direction_lattice(60)
 
 
 @pytest.fixture(scope="module")
-def scorer(sparse: Path) -> Scorer:
+def scorer(sparse):
     """The way to score without the façade."""
     return load_scorer(WEIGHTS, LocalizationMap.from_colmap(sparse, occlusion=HiddenPointRemoval()))
 
 
-def all_scores(scorer: Scorer, points: np.ndarray) -> np.ndarray:
+def all_scores(scorer, points):
     poses = poses_looking_along(np.repeat(points, len(AXES), axis=0), np.tile(AXES, (len(points), 1)))
     return scorer.score(poses).reshape(len(points), len(AXES))
 
 
-def test_best_views_are_those_of_the_scorer(look: WhereToLook, scorer: Scorer) -> None:
+def test_best_views_are_those_of_the_scorer(look, scorer):
     scores = all_scores(scorer, POINTS)
     views = look.best(POINTS, 3)
     assert Exported is WhereToLook
@@ -58,7 +54,7 @@ def test_best_views_are_those_of_the_scorer(look: WhereToLook, scorer: Scorer) -
 
 
 @pytest.mark.parametrize("camera", [None, ColmapCamera("SIMPLE_RADIAL", 640, 480, (320.0, 320.0, 240.0, 0.05))])
-def test_all_directions_at_once_score_as_one_by_one(camera: ColmapCamera | None, tmp_path: Path) -> None:
+def test_all_directions_at_once_score_as_one_by_one(camera, tmp_path):
     folder = write_room(tmp_path / "sparse", text=camera is None)
     localization_map = LocalizationMap.from_colmap(folder, camera, occlusion=HiddenPointRemoval())
     scorer = load_scorer(WEIGHTS, localization_map)
@@ -69,7 +65,7 @@ def test_all_directions_at_once_score_as_one_by_one(camera: ColmapCamera | None,
     np.testing.assert_allclose(odds[0], odds[1], atol=0.02)
 
 
-def test_a_sample_of_the_landmarks_ranks_as_all(tmp_path: Path) -> None:
+def test_a_sample_of_the_landmarks_ranks_as_all(tmp_path):
     localization_map = LocalizationMap.from_colmap(write_room(tmp_path / "sparse", n=6000))
     scorer = load_scorer(WEIGHTS, localization_map)
     poses = poses_looking_along(np.repeat(POINTS, len(AXES), axis=0), np.tile(AXES, (len(POINTS), 1)))
@@ -82,7 +78,7 @@ def test_a_sample_of_the_landmarks_ranks_as_all(tmp_path: Path) -> None:
     assert (slow.max(axis=1) - slow[rows, fast.argmax(axis=1)] < 0.01).all()
 
 
-def test_the_sequence_is_the_best_of_all(sparse: Path) -> None:
+def test_the_sequence_is_the_best_of_all(sparse):
     look = WhereToLook.from_colmap(sparse, weights=WEIGHTS, directions=12, device="cpu")
     axes = look.directions
     limit = 60.0
@@ -101,7 +97,7 @@ def test_the_sequence_is_the_best_of_all(sparse: Path) -> None:
     assert (turned <= limit + 1e-4).all()
 
 
-def test_waypoints_outside_the_map(look: WhereToLook) -> None:
+def test_waypoints_outside_the_map(look):
     given = np.concatenate([POINTS[:2], [[300.0, 2.0, 1.5]], POINTS[2:]])
     with pytest.raises(TableError):
         look.best(given)
@@ -114,9 +110,7 @@ def test_waypoints_outside_the_map(look: WhereToLook) -> None:
         look.best(look.localization_map.landmarks.points[3])
 
 
-def test_a_mesh_hides_landmarks_and_holds_waypoints_inside_geometry(
-    look: WhereToLook, sparse: Path, tmp_path: Path
-) -> None:
+def test_a_mesh_hides_landmarks_and_holds_waypoints_inside_geometry(look, sparse, tmp_path):
     save_glb(furnished_room(), tmp_path / "room.glb")
     open_room = WhereToLook.from_colmap(sparse, weights=WEIGHTS, directions=60, occlusion="none", device="cpu")
     room = WhereToLook.from_colmap(sparse, weights=WEIGHTS, directions=60, mesh=tmp_path / "room.glb", device="cpu")
@@ -135,7 +129,7 @@ def test_a_mesh_hides_landmarks_and_holds_waypoints_inside_geometry(
         assert len(grid) > 5 and finder.space.is_free(grid.points).all()
 
 
-def test_depth_images(sparse: Path, tmp_path: Path) -> None:
+def test_depth_images(sparse, tmp_path):
     model = pycolmap.Reconstruction(sparse)
     renderer = WarpRenderer(furnished_room(), "cpu")
     (tmp_path / "depth").mkdir()
@@ -150,7 +144,7 @@ def test_depth_images(sparse: Path, tmp_path: Path) -> None:
         WhereToLook.from_colmap(sparse, weights=WEIGHTS, depth=tmp_path, device="cpu")
 
 
-def test_depth_images_of_a_camera_with_distortion(tmp_path: Path) -> None:
+def test_depth_images_of_a_camera_with_distortion(tmp_path):
     """A wall at 2 m and x > 0.8 m, in images twice as large as their depth images; colours are next to the depths."""
     lens = pycolmap.Camera(model="SIMPLE_RADIAL", width=400, height=300, params=[300, 200, 150, -0.2], camera_id=1)
     model = pycolmap.Reconstruction()
@@ -170,8 +164,8 @@ def test_depth_images_of_a_camera_with_distortion(tmp_path: Path) -> None:
     assert points[:, 0].min() == pytest.approx(0.8, abs=2 / 150)
 
 
-def test_cameras(sparse: Path) -> None:
-    def camera(**options: object) -> object:
+def test_cameras(sparse):
+    def camera(**options):
         return WhereToLook.from_colmap(
             sparse, weights=WEIGHTS, occlusion="none", device="cpu", **options
         ).localization_map.camera
@@ -195,12 +189,12 @@ def test_cameras(sparse: Path) -> None:
         ({"device": "tpu"}, ConfigError),
     ],
 )  # fmt: skip
-def test_invalid_options_are_rejected(sparse: Path, options: dict, error: type[WhereToLookError]) -> None:
+def test_invalid_options_are_rejected(sparse, options, error):
     with pytest.raises(error):
         WhereToLook.from_colmap(sparse, **{"weights": WEIGHTS, "device": "cpu", **options})
 
 
-def test_looks_chosen_together_score_more_than_one(look: WhereToLook, tmp_path: Path) -> None:
+def test_looks_chosen_together_score_more_than_one(look, tmp_path):
     one = look.best(POINTS, looks=1)
     three = look.best(POINTS, looks=3)
     np.testing.assert_allclose(one.axes, look.best(POINTS).axes, atol=1e-9)
@@ -217,7 +211,7 @@ def test_looks_chosen_together_score_more_than_one(look: WhereToLook, tmp_path: 
         assert ("set_score" in (tmp_path / "views.csv").read_text()) == written
 
 
-def test_a_sequence_stops_where_one_look_will_not_do(look: WhereToLook, tmp_path: Path) -> None:
+def test_a_sequence_stops_where_one_look_will_not_do(look, tmp_path):
     sequence = look.best(POINTS, max_turn_deg=10)
     asked = float(np.median(sequence.score))
     views = look.best(POINTS, max_turn_deg=10, looks=3, least_score=asked)
@@ -250,12 +244,12 @@ def test_a_sequence_stops_where_one_look_will_not_do(look: WhereToLook, tmp_path
         {"looks": 3, "max_turn_deg": 10, "least_score": 0.5, "max_total_turn_deg": 90},
     ],
 )  # fmt: skip
-def test_invalid_requests_are_rejected(options: dict) -> None:
+def test_invalid_requests_are_rejected(options):
     with pytest.raises(ConfigError):
         SelectionRequest(**options)
 
 
-def test_limits_on_pan_are_relative_to_the_heading(look: WhereToLook, tmp_path: Path) -> None:
+def test_limits_on_pan_are_relative_to_the_heading(look, tmp_path):
     heading = np.array([170.0, -90.0, 0.0, 45.0])
     half = np.radians(heading) / 2
     robot = np.column_stack([np.arange(4), POINTS, np.zeros((4, 2)), np.sin(half), np.cos(half)])  # x forward, z up
@@ -287,7 +281,7 @@ def test_limits_on_pan_are_relative_to_the_heading(look: WhereToLook, tmp_path: 
         look.best(POINTS, heading_deg=heading, pan_deg=(0, 0.01))
 
 
-def test_best_views_apart(look: WhereToLook) -> None:
+def test_best_views_apart(look):
     near = look.best(POINTS, 4)
     apart = look.best(POINTS, 4, apart_deg=50)
     np.testing.assert_allclose(apart.axes[::4], near.axes[::4], atol=1e-9)

@@ -1,9 +1,5 @@
 """The adapt stage, from labels that are there to weights that score."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import numpy as np
 import pandas as pd
 import pytest
@@ -22,7 +18,7 @@ from wheretolook.training.weights import read_training
 
 
 @pytest.fixture
-def dataset(tmp_path: Path) -> Dataset:
+def dataset(tmp_path):
     """Two labelled scenes of weak landmarks, of which the weights that ship expect other labels than they have."""
     dataset = make_dataset(tmp_path / "data" / "tiny", ("train", "test"))
     for scene in dataset.scenes:
@@ -30,14 +26,14 @@ def dataset(tmp_path: Path) -> Dataset:
     return dataset
 
 
-def run(dataset: Dataset, *options: str) -> int:
+def run(dataset, *options):
     root = dataset.root
     camera = ["--camera.width", "160", "--camera.height", "120", "--camera.focal_px", "80", "--camera.fov_deg", "null"]
     where = ["--name", root.name, "--data", str(root.parent), "--tracking.folder", str(root.parent / "mlruns")]
     return main(["adapt", *where, "--device", "cpu", *camera, *options])
 
 
-def test_adapted_weights_have_a_lower_loss_and_are_logged(dataset: Dataset, capsys: pytest.CaptureFixture[str]) -> None:
+def test_adapted_weights_have_a_lower_loss_and_are_logged(dataset, capsys):
     shards = dataset.scenes[1].adapt_shards / "000000"
     shards.mkdir(parents=True)  # of a run before these views had labels
     assert run(dataset, "--scene", "scene-1") == 0
@@ -60,7 +56,7 @@ def test_adapted_weights_have_a_lower_loss_and_are_logged(dataset: Dataset, caps
     assert one.data.metrics["better"] == 1.0
 
 
-def test_weights_without_a_gain_are_not_kept(dataset: Dataset, capsys: pytest.CaptureFixture[str]) -> None:
+def test_weights_without_a_gain_are_not_kept(dataset, capsys):
     scene = dataset.scenes[1]
     table = scene.read_table()
     scored = load_scorer(None, scene.localization_map(scene.camera)).score(poses(table))
@@ -91,16 +87,14 @@ def test_weights_without_a_gain_are_not_kept(dataset: Dataset, capsys: pytest.Ca
         ("--scene", "scene-1", "--label.changes", "0.5"),
     ],
 )
-def test_bad_input_is_named(
-    dataset: Dataset, options: tuple[str, ...], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_bad_input_is_named(dataset, options, capsys, monkeypatch):
     monkeypatch.chdir(dataset.root)
     (dataset.root / "dataset").write_text("")
     assert run(dataset, *options) == 2
     assert capsys.readouterr().err.startswith("wheretolook: error: ")
 
 
-def test_gains_are_those_of_known_cases() -> None:
+def test_gains_are_those_of_known_cases():
     """Two locations of two views: the first chooses wrongly before and rightly after."""
     good = np.array([True, False, True, False])
     before = np.array([-1.0, 1.0, 1.0, -1.0])
@@ -114,9 +108,7 @@ def test_gains_are_those_of_known_cases() -> None:
 
 
 @pytest.mark.slow
-def test_views_are_labelled_for_some_minutes_and_found_again(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_views_are_labelled_for_some_minutes_and_found_again(tmp_path, capsys):
     """From nothing: a small apartment is made, mapped and sampled; then adapt labels, stops, and goes on."""
     settings = tmp_path / "tiny.yaml"
     only_test = EXPERIMENT.replace("train: 1", "train: 0")

@@ -1,12 +1,9 @@
 """The evaluate stage on a tiny dataset whose labels follow a known rule."""
 
-from __future__ import annotations
-
 import shutil
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -17,7 +14,6 @@ from learning_options import train_config
 from synthetic_dataset import make_dataset
 from wheretolook.commands.evaluate import evaluate_methods as evaluate
 from wheretolook.commands.train import train_methods as train
-from wheretolook.dataset.layout import Dataset
 from wheretolook.dataset.viewpoint_files import write_table
 from wheretolook.dataset.viewpoint_table import LABELS, NO_POSE, UNLABELLED, is_good, poses
 from wheretolook.evaluation.config import EvaluateConfig
@@ -35,21 +31,19 @@ RULES = replace(CONFIG, methods=("random", "visible", "bins"))
 
 
 @pytest.fixture(scope="module")
-def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+def dataset(tmp_path_factory):
     splits = ("train", "train", "test", "test", "val")
-    return make_dataset(tmp_path_factory.mktemp("data") / "tiny", splits, n_locations=14, n_directions=16)  # type: ignore[arg-type]
+    return make_dataset(tmp_path_factory.mktemp("data") / "tiny", splits, n_locations=14, n_directions=16)
 
 
-def logged_runs(tracking: TrackingConfig) -> tuple[Any, dict[str, Any]]:
+def logged_runs(tracking):
     """Return the newest evaluation's run, and the runs of its methods."""
     parent = newest_run(tracking, "evaluate").info
     found = client(tracking).search_runs([parent.experiment_id], f"tags.mlflow.parentRunId = '{parent.run_id}'")
     return parent, {run.data.params["method"]: run for run in found}
 
 
-def test_evaluation_writes_prints_and_logs(
-    dataset: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_evaluation_writes_prints_and_logs(dataset, tmp_path, capsys):
     tracking = TrackingConfig(str(tmp_path / "mlruns"), "tiny")
     models = train(dataset, TWO, tracking, False)
     table = evaluate(dataset, CONFIG, tracking, models=models, progress=True)
@@ -91,7 +85,7 @@ def test_evaluation_writes_prints_and_logs(
     assert [run.info.run_id for run in finished_runs(moved, "evaluate")] == [later, parent.run_id]
 
 
-def test_both_localizers_are_reported(tmp_path: Path) -> None:
+def test_both_localizers_are_reported(tmp_path):
     """By the first RANSAC result the same views localize, but none at a location with an odd number."""
     tracking = TrackingConfig(str(tmp_path / "mlruns"), "both")
     dataset = make_dataset(tmp_path / "both", ("test", "test"), n_locations=10, n_directions=12)
@@ -119,7 +113,7 @@ def test_both_localizers_are_reported(tmp_path: Path) -> None:
     assert runs["bins"].data.metrics["top-1/first_raw_0.05m_0.4deg"] == pytest.approx(first_share)
 
 
-def test_learned_methods_are_calibrated_on_the_val_scenes(dataset: Dataset, tmp_path: Path) -> None:
+def test_learned_methods_are_calibrated_on_the_val_scenes(dataset, tmp_path):
     tracking = TrackingConfig(str(tmp_path / "mlruns"))
     (model,) = train(dataset, train_config("mlp-2d+z", epochs=2, hidden=(16,), accelerator="cpu"), tracking, False)
     config = replace(CONFIG, methods=("bins", "mlp"))
@@ -150,7 +144,7 @@ def test_learned_methods_are_calibrated_on_the_val_scenes(dataset: Dataset, tmp_
     assert not (results / "calibration.csv").exists()
 
 
-def test_candidates_are_chosen_by_visibility(tmp_path: Path) -> None:
+def test_candidates_are_chosen_by_visibility(tmp_path):
     dataset = make_dataset(tmp_path / "ranked", ("test", "test"), n_locations=14, n_directions=16)
     rng = np.random.default_rng(0)
     tables = []
@@ -183,10 +177,10 @@ def test_candidates_are_chosen_by_visibility(tmp_path: Path) -> None:
         evaluate(dataset, replace(config, candidates=(0, 1)), tracking, progress=False)
 
 
-def test_the_same_evaluation_is_logged_once(dataset: Dataset, tmp_path: Path) -> None:
+def test_the_same_evaluation_is_logged_once(dataset, tmp_path):
     tracking = TrackingConfig(str(tmp_path / "mlruns"))
 
-    def evaluate_again(config: EvaluateConfig = RULES) -> list[str]:
+    def evaluate_again(config=RULES):
         evaluate(dataset, config, tracking, progress=False)
         return [run.info.run_id for run in finished_runs(tracking, "evaluate")]
 
@@ -217,12 +211,12 @@ def test_the_same_evaluation_is_logged_once(dataset: Dataset, tmp_path: Path) ->
         {"heading": ((0.0, 0, 0),)},
     ],
 )  # fmt: skip
-def test_invalid_options(options: dict) -> None:
+def test_invalid_options(options):
     with pytest.raises(ConfigError):
         EvaluateConfig(**options)
 
 
-def test_invalid_input(dataset: Dataset, tmp_path: Path) -> None:
+def test_invalid_input(dataset, tmp_path):
     tracking = TrackingConfig(str(tmp_path / "mlruns"))
     untrained = make_dataset(tmp_path / "untrained", ("test",), n_locations=2, n_directions=4)
     unlabelled = make_dataset(tmp_path / "unlabelled", ("test",), n_locations=2, n_directions=4)

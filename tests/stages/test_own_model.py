@@ -1,10 +1,7 @@
 """A scene made from a COLMAP model, through the stages, with and without a mesh; and triangulated again."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import asdict, replace
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -46,7 +43,7 @@ def empty_room():
     return quads_mesh(box_quads((0, 0, 0), SIZE, inward=True), [random_texture(np.random.default_rng(0), 64, 64)])
 
 
-def room_model(n_points: int = 800, cameras: tuple[PinholeCamera, ...] = (LOOKS,)) -> pycolmap.Reconstruction:
+def room_model(n_points=800, cameras=(LOOKS,)):
     """Return a model of points on the walls of a room of `SIZE`, seen from 36 poses at a height of 1.4 m."""
     rng = np.random.default_rng(0)
     model = pycolmap.Reconstruction()
@@ -76,19 +73,19 @@ def room_model(n_points: int = 800, cameras: tuple[PinholeCamera, ...] = (LOOKS,
     return model
 
 
-def save(model: pycolmap.Reconstruction, folder: Path) -> Path:
+def save(model, folder):
     folder.mkdir(parents=True)
     model.write_text(str(folder))
     return folder
 
 
-def experiment_of(model: Path, data: Path, **existing: object) -> AllOptions:
+def experiment_of(model, data, **existing):
     return AllOptions(
         name="mine",
         data=data,
         device="cpu",
         scenes=ScenesConfig(mapped_space=MappedSpaceConfig(max_camera_distance_m=0.6)),
-        mapping=MapConfig(existing=ExistingModelConfig(model, **existing), frame=FrameOptions(scale=1)),  # type: ignore[arg-type]
+        mapping=MapConfig(existing=ExistingModelConfig(model, **existing), frame=FrameOptions(scale=1)),
         sample=SampleConfig(grid=(6, 5, 3), directions=40, keep=10, max_locations=6),
         viewpoint_map=ViewpointMapConfig(grid=(6, 5, 3), directions=30, method="visible"),
         tracking=TrackingConfig(str(data / "mlruns")),
@@ -120,7 +117,7 @@ def test_from_a_model_to_a_planned_path(tmp_path, with_mesh):
     with pytest.raises(MapError if with_mesh else SceneError):
         run(Label, experiment)
 
-    said: list[str] = []
+    said = []
     run(Map, experiment, said.append)
     run(Sample, experiment, said.append)
     assert sum("reusing" in line for line in said) == 2

@@ -1,11 +1,8 @@
 """The whole line on two tiny apartments: from the command line, again, from the same seed, and after damage."""
 
-from __future__ import annotations
-
 import shutil
 import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -22,7 +19,7 @@ from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import camera_centers
 from wheretolook.inputs.localization_map import LocalizationMap
-from wheretolook.localization.shard import LabelledShard, SceneJob, ShardWorker
+from wheretolook.localization.shard import ShardWorker
 from wheretolook.scorers.registry import scorers
 from wheretolook.scorers.train_config import TrainConfig
 from wheretolook.scorers.weights import load_scorer
@@ -50,7 +47,7 @@ evaluate: {resamples: 20, top_n: [1], methods: [random, visible, bins, fisher-tr
 """
 
 
-def run(stage: str, folder: Path, *options: str) -> int:
+def run(stage, folder, *options):
     return main(
         [stage, "--config", str(folder / "tiny.yaml"), "--data", str(folder / "data"),
          "--tracking.folder", str(folder / "mlruns"), "--device", "cpu", *options]
@@ -58,7 +55,7 @@ def run(stage: str, folder: Path, *options: str) -> int:
 
 
 @pytest.fixture(scope="module")
-def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def demo(tmp_path_factory):
     folder = tmp_path_factory.mktemp("demo")
     (folder / "tiny.yaml").write_text(EXPERIMENT)
     assert run("demo", folder) == 0
@@ -66,17 +63,17 @@ def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def copy(demo: Path, tmp_path: Path) -> Path:
+def copy(demo, tmp_path):
     """A copy that may be damaged."""
     shutil.copytree(demo, tmp_path / "copy")
     return tmp_path / "copy"
 
 
-def results(folder: Path) -> list[Path]:
+def results(folder):
     return sorted(path for path in folder.glob("data/tiny/*/**/*") if path.is_file() and path.name != "stages.json")
 
 
-def test_every_stage_leaves_its_result(demo: Path) -> None:
+def test_every_stage_leaves_its_result(demo):
     dataset = Dataset.load(demo / "data" / "tiny")
     assert [scene.split for scene in dataset.scenes] == ["train", "test"]
     for scene in dataset.scenes:
@@ -91,7 +88,7 @@ def test_every_stage_leaves_its_result(demo: Path) -> None:
     assert (dataset.root / "results" / "overview.png").stat().st_size > 10_000
 
 
-def test_run_again_it_reuses_what_is_there(demo: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_run_again_it_reuses_what_is_there(demo, capsys):
     before = {path: path.stat().st_mtime_ns for path in results(demo)}
     assert run("demo", demo) == 0
     assert {path: path.stat().st_mtime_ns for path in results(demo)} == before
@@ -99,7 +96,7 @@ def test_run_again_it_reuses_what_is_there(demo: Path, capsys: pytest.CaptureFix
     assert "[evaluate] reusing" in capsys.readouterr().out
 
 
-def test_all_methods_are_trained_and_compared(copy: Path) -> None:
+def test_all_methods_are_trained_and_compared(copy):
     methods = EvaluateConfig().methods
     learned = TrainConfig().methods
     assert run("train", copy, "--train.methods", f"[{','.join(learned)}]") == 0
@@ -110,9 +107,7 @@ def test_all_methods_are_trained_and_compared(copy: Path) -> None:
 
 
 @pytest.mark.parametrize("workers", ["1", "2"])
-def test_the_same_seed_gives_the_same_bytes(
-    demo: Path, tmp_path: Path, workers: str, request: pytest.FixtureRequest
-) -> None:
+def test_the_same_seed_gives_the_same_bytes(demo, tmp_path, workers, request):
     if workers == "1":
         request.getfixturevalue("in_this_process")
     (tmp_path / "tiny.yaml").write_text(EXPERIMENT)
@@ -124,7 +119,7 @@ def test_the_same_seed_gives_the_same_bytes(
 
 
 @pytest.mark.usefixtures("in_this_process", "no_pictures_here")
-def test_a_changed_setting_remakes_what_depends_on_it(copy: Path) -> None:
+def test_a_changed_setting_remakes_what_depends_on_it(copy):
     scene = Dataset.load(copy / "data" / "tiny").scenes[0]
     mesh = fingerprint(scene.mesh)
     table = scene.read_table()
@@ -136,7 +131,7 @@ def test_a_changed_setting_remakes_what_depends_on_it(copy: Path) -> None:
 
 
 @pytest.mark.usefixtures("in_this_process", "no_pictures_here")
-def test_matches_are_stored_on_request_and_removed_with_their_labels(copy: Path) -> None:
+def test_matches_are_stored_on_request_and_removed_with_their_labels(copy):
     scene, *_ = Dataset.load(copy / "data" / "tiny").scenes
     before = scene.table.read_bytes()
     stored = ("label", copy, "--label.store_matches", "true")
@@ -152,7 +147,7 @@ def test_matches_are_stored_on_request_and_removed_with_their_labels(copy: Path)
 
 
 @pytest.mark.usefixtures("in_this_process", "no_pictures_here")
-def test_appearances_replace_the_labels_and_are_removed_again(copy: Path) -> None:
+def test_appearances_replace_the_labels_and_are_removed_again(copy):
     scene, *_ = Dataset.load(copy / "data" / "tiny").scenes
     before = scene.table.read_bytes()
     assert run("label", copy, "--label.appearance", "0.6") == 0
@@ -164,7 +159,7 @@ def test_appearances_replace_the_labels_and_are_removed_again(copy: Path) -> Non
 
 
 @pytest.mark.usefixtures("in_this_process", "no_pictures_here")
-def test_views_of_changed_scenes_are_labelled_and_removed_again(copy: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_views_of_changed_scenes_are_labelled_and_removed_again(copy, capsys):
     scene, *_ = Dataset.load(copy / "data" / "tiny").scenes
     before = scene.table.read_bytes()
     old = scene.read_table()
@@ -188,17 +183,15 @@ def test_views_of_changed_scenes_are_labelled_and_removed_again(copy: Path, caps
 
 
 @pytest.mark.usefixtures("in_this_process", "no_pictures_here")
-def test_labels_by_another_localizer_replace_the_old_ones_when_they_are_finished(
-    copy: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_labels_by_another_localizer_replace_the_old_ones_when_they_are_finished(copy, monkeypatch):
     scenes = Dataset.load(copy / "data" / "tiny").scenes
     before = {scene: scene.table.read_bytes() for scene in scenes}
     plain = [scene.read_table() for scene in scenes]
     hypotheses = ("label", copy, "--label.localizer.method", "hypotheses")
     labelled = ShardWorker.label
-    done: list[pd.DataFrame] = []
+    done = []
 
-    def interrupted(worker: ShardWorker, job: SceneJob, rows: pd.DataFrame) -> LabelledShard:
+    def interrupted(worker, job, rows):
         if len(done) == 1:
             raise KeyboardInterrupt
         done.append(rows)
@@ -217,7 +210,7 @@ def test_labels_by_another_localizer_replace_the_old_ones_when_they_are_finished
     assert {scene: scene.table.read_bytes() for scene in scenes} == before
 
 
-def test_three_lines_score_viewpoints_of_a_colmap_model(demo: Path) -> None:
+def test_three_lines_score_viewpoints_of_a_colmap_model(demo):
     scene = Dataset.load(demo / "data" / "tiny").scenes[1]
     table = scene.read_table()
     localization_map = LocalizationMap.from_colmap(scene.map, PinholeCamera(320, 240, 160), mesh=scene.mesh)
@@ -229,7 +222,7 @@ def test_three_lines_score_viewpoints_of_a_colmap_model(demo: Path) -> None:
     np.testing.assert_array_equal(localization_map.bin_views(poses(table)).counts, binned.counts)
 
 
-def test_every_occlusion_model_scores_the_same_viewpoints(copy: Path) -> None:
+def test_every_occlusion_model_scores_the_same_viewpoints(copy):
     root = copy / "data" / "tiny"
     stored = pd.read_csv(root / "results" / "scores.csv")
     stored = stored[stored["method"] != "set that ships"].reset_index(drop=True)  # beside it in the demo alone
@@ -245,7 +238,7 @@ def test_every_occlusion_model_scores_the_same_viewpoints(copy: Path) -> None:
 
 
 @pytest.mark.parametrize("model", ["tsdf", "hidden-points", "none"])
-def test_viewpoints_can_be_sampled_with_every_occlusion_model(copy: Path, model: str) -> None:
+def test_viewpoints_can_be_sampled_with_every_occlusion_model(copy, model):
     scene = Dataset.load(copy / "data" / "tiny").scenes[0]
     by_mesh = StoredOcclusion.load(scene.occlusion)
     assert by_mesh.name == "mesh"
@@ -261,7 +254,7 @@ def test_viewpoints_can_be_sampled_with_every_occlusion_model(copy: Path, model:
     assert agreement.recall > {"tsdf": 0.9, "hidden-points": 0.6, "none": 0.999}[model]
 
 
-def test_a_stage_refuses_outdated_inputs(copy: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_stage_refuses_outdated_inputs(copy, capsys):
     mesh = Dataset.load(copy / "data" / "tiny").scenes[0].mesh
     before = mesh.stat().st_mtime_ns
     assert run("scenes", copy, "--camera.focal_px", "200") == 0
@@ -272,7 +265,7 @@ def test_a_stage_refuses_outdated_inputs(copy: Path, capsys: pytest.CaptureFixtu
         assert f"Run `wheretolook {needed}`" in capsys.readouterr().err
 
 
-def test_weights_are_not_tested_on_scenes_they_were_trained_on(copy: Path) -> None:
+def test_weights_are_not_tested_on_scenes_they_were_trained_on(copy):
     dataset = Dataset.load(copy / "data" / "tiny")
     replace(dataset, scenes=tuple(replace(scene, split="test") for scene in dataset.scenes)).save()
     weights = dataset.root / "weights" / "mlp-2d.safetensors"
@@ -284,7 +277,7 @@ PATHS = ["--paths.grid", "[4, 4, 2]", "--paths.directions", "40", "--paths.min_d
          "60", "--paths.planner.time_s", "1", "--paths.planner.spacing_m", "0.5"]  # fmt: skip
 
 
-def test_planned_paths_are_rendered_and_localized(copy: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_planned_paths_are_rendered_and_localized(copy, capsys):
     options = ["compare-paths", copy, "--paths.pairs", "1", "--paths.methods", "[forward,set]", *PATHS]
     assert run(*options) == 0
     root = copy / "data" / "tiny" / "results"
@@ -318,7 +311,7 @@ def test_planned_paths_are_rendered_and_localized(copy: Path, capsys: pytest.Cap
         assert run(*options, *invalid) == 2
 
 
-def test_a_camera_at_an_unknown_pose_turns_until_it_is_localized(copy: Path) -> None:
+def test_a_camera_at_an_unknown_pose_turns_until_it_is_localized(copy):
     options = ["--places", "2", "--views", "3", "--policies", "[even,gain]"]
     assert run("relocalize", copy, *options, "--film", str(copy / "lost.webp")) == 0
     root = copy / "data" / "tiny" / "results"
@@ -335,7 +328,7 @@ def test_a_camera_at_an_unknown_pose_turns_until_it_is_localized(copy: Path) -> 
     assert run("relocalize", copy, "--policies", "[forward]") == 2
 
 
-def test_a_path_is_planned_and_shown(copy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_path_is_planned_and_shown(copy, tmp_path, monkeypatch):
     scene = Dataset.load(copy / "data" / "tiny").split("test")[0]
     centers = camera_centers(poses(scene.read_table()))
     out = tmp_path / "path"
@@ -357,7 +350,7 @@ def test_a_path_is_planned_and_shown(copy: Path, tmp_path: Path, monkeypatch: py
         assert run("plan", copy, *options, *invalid) == 2
 
 
-def test_depth_images_bound_the_free_space(copy: Path) -> None:
+def test_depth_images_bound_the_free_space(copy):
     """With the occlusion model tsdf; locations are sampled by the mesh all the same."""
     where = ["--config", str(copy / "tiny.yaml"), "--data", str(copy / "data"), "--device", "cpu"]
     experiment = parse_command("plan", [*where, "--occlusion.model", "tsdf", "--occlusion.voxel_m", "0.04"])

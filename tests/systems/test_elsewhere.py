@@ -1,12 +1,9 @@
 """The commands run where Linux's and POSIX's functions, modules, signals and files are missing, with the same result."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +18,7 @@ from wheretolook.dataset.layout import Dataset
 SCRIPT = Path(__file__).with_name("elsewhere.py")
 
 
-def run_elsewhere(folder: Path, *commands: Sequence[str]) -> str:
+def run_elsewhere(folder, *commands):
     """Run commands in a folder, in one process. Returns what they print."""
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
     run = [sys.executable, str(SCRIPT), json.dumps(commands)]
@@ -30,7 +27,7 @@ def run_elsewhere(folder: Path, *commands: Sequence[str]) -> str:
     return done.stdout
 
 
-def test_select_and_score(tmp_path: Path) -> None:
+def test_select_and_score(tmp_path):
     sparse = write_room(tmp_path / "sparse")
     np.savetxt(tmp_path / "at.csv", POINTS, delimiter=",", header="x,y,z", comments="")
     given = ["--map", str(sparse), "--weights", str(WEIGHTS), "--device", "cpu"]
@@ -43,7 +40,7 @@ def test_select_and_score(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_from_scenes_to_evaluation(tmp_path: Path) -> None:
+def test_from_scenes_to_evaluation(tmp_path):
     (tmp_path / "tiny.yaml").write_text(EXPERIMENT.replace("workers: 1", "workers: 2"))
     stages = ("scenes", "map", "sample", "label", "train", "evaluate")
     run_elsewhere(tmp_path, *([stage, "--config", "tiny.yaml", "--device", "cpu"] for stage in stages))
@@ -55,7 +52,7 @@ def test_from_scenes_to_evaluation(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["sched_getaffinity", "fcntl", "SIGALRM", "/proc/meminfo"])
-def test_what_elsewhere_lacks_is_missing(name: str, tmp_path: Path) -> None:
+def test_what_elsewhere_lacks_is_missing(name, tmp_path):
     """Otherwise the tests above would pass on Linux in any case."""
     code = {
         "sched_getaffinity": "import os; os.sched_getaffinity(0)",

@@ -1,7 +1,5 @@
 """Sets of looks joined from stored matches: their labels, the comparison of strategies, and when to stop looking."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +7,7 @@ import pandas as pd
 import pytest
 
 from synthetic_dataset import CAMERA, make_scene
-from wheretolook.dataset.layout import Dataset, SceneFolder
+from wheretolook.dataset.layout import Dataset
 from wheretolook.dataset.viewpoint_files import read_table, write_table
 from wheretolook.dataset.viewpoint_table import poses
 from wheretolook.evaluation.config import EvaluateConfig
@@ -27,7 +25,7 @@ from wheretolook_paper.evaluation.looks import look_table, stopping_table
 WEIGHTS = Path(__file__).parents[3] / "data" / "release" / "weights" / "set.safetensors"
 
 
-def with_matches(scene: SceneFolder) -> pd.DataFrame:
+def with_matches(scene):
     """Return the scene's table with matches of each view's landmarks, half of them wrong, and the resulting labels."""
     rng = np.random.default_rng(0)
     table = read_table(scene.table)
@@ -54,7 +52,7 @@ def with_matches(scene: SceneFolder) -> pd.DataFrame:
 
 
 @pytest.fixture(scope="module")
-def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+def dataset(tmp_path_factory):
     root = tmp_path_factory.mktemp("data") / "tiny"
     scene = make_scene(root / "one", "test", 0, n_locations=6, n_directions=16, n_landmarks=600)
     write_table(
@@ -67,16 +65,16 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
 
 
 @pytest.fixture(scope="module")
-def table(dataset: Dataset) -> pd.DataFrame:
+def table(dataset):
     return read_table(dataset.scenes[0].table, pixels=True)
 
 
 @pytest.fixture(scope="module")
-def points(dataset: Dataset) -> np.ndarray:
+def points(dataset):
     return Landmarks.load(dataset.scenes[0].landmarks).points
 
 
-def test_a_set_of_one_has_the_label_of_its_view(table: pd.DataFrame, points: np.ndarray) -> None:
+def test_a_set_of_one_has_the_label_of_its_view(table, points):
     rows = np.flatnonzero(table["n_inliers"] > 0)[:20]
     labelled = label_sets(table, rows[:, None], points, CAMERA)
     assert list(labelled.columns) == list(SET_COLUMNS)
@@ -85,7 +83,7 @@ def test_a_set_of_one_has_the_label_of_its_view(table: pd.DataFrame, points: np.
     np.testing.assert_allclose(labelled["error_m"], table["error_m"].to_numpy()[rows], rtol=1e-3)
 
 
-def test_sets_localize_where_their_looks_do_not(table: pd.DataFrame, points: np.ndarray) -> None:
+def test_sets_localize_where_their_looks_do_not(table, points):
     """Of each place's four middling looks the joint pose is better than the best of their own."""
     sets = []
     for _, part in table.groupby("location_id"):
@@ -102,7 +100,7 @@ def test_sets_localize_where_their_looks_do_not(table: pd.DataFrame, points: np.
     assert noisy["error_m"].max() < 0.2 and not np.allclose(noisy["error_m"], labelled["error_m"][:1], rtol=1e-3)
 
 
-def test_invalid_sets(table: pd.DataFrame, points: np.ndarray) -> None:
+def test_invalid_sets(table, points):
     first, other = (np.flatnonzero(table["location_id"] == location)[0] for location in (0, 1))
     seen = int(np.flatnonzero(table["n_inliers"] > 0)[0])
     for views, rows, landmarks, noise, error in (
@@ -117,7 +115,7 @@ def test_invalid_sets(table: pd.DataFrame, points: np.ndarray) -> None:
             label_sets(views, [rows], landmarks, CAMERA, turn_noise_deg=noise)
 
 
-def test_strategies_are_compared_and_logged(dataset: Dataset, tmp_path: Path) -> None:
+def test_strategies_are_compared_and_logged(dataset, tmp_path):
     tracking = TrackingConfig(tmp_path / "mlruns")
     config = LookConfig(numbers=(1, 3), strategies=("together", "in-turn", "one-by-one", "even", "fisher"))
     found = evaluate_look_sets(dataset, EvaluateConfig(weights=(WEIGHTS,)), tracking, "cpu", config, False)
@@ -132,7 +130,7 @@ def test_strategies_are_compared_and_logged(dataset: Dataset, tmp_path: Path) ->
     pd.testing.assert_frame_equal(pd.read_csv(dataset.root / "results" / "looks.csv"), found, check_dtype=False)
 
 
-def test_one_stops_when_sure_enough() -> None:
+def test_one_stops_when_sure_enough():
     """Two places: sure after one look, and only after three; by hand."""
     columns = {"strategy": "in-turn", "scene": "a", "n_looks": [1, 2, 3] * 2, "location_id": [0] * 3 + [1] * 3}
     columns |= {"confidence": [0.95, 0.97, 0.99, 0.2, 0.6, 0.995], "good": [True, True, True, False, False, True]}
@@ -145,6 +143,6 @@ def test_one_stops_when_sure_enough() -> None:
     assert shares.loc[3, "sure"] == 1.0 and shares.loc[3, "sure_right"] == 1.0
 
 
-def test_features_of_the_confidence_by_hand() -> None:
+def test_features_of_the_confidence_by_hand():
     features = confidence_features([99], [200], [0], [30], [10], [np.inf])
     np.testing.assert_allclose(features[0], [0, np.log(99.5 / 201), np.log(2), np.log(10)])

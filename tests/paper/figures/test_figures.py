@@ -1,9 +1,5 @@
 """Figures of labels, scores, calibration and the overview draw the numbers of their input."""
 
-from __future__ import annotations
-
-from typing import Any
-
 import numpy as np
 import pandas as pd
 import pytest
@@ -25,7 +21,7 @@ from wheretolook_paper.figures.scores import regret_figure, score_figure
 from wheretolook_paper.styles import method_style
 
 
-def test_label_figure_draws_shares_and_errors() -> None:
+def test_label_figure_draws_shares_and_errors():
     summary = label_summary(pooled_labels({"hall": HALL, "shed": SHED}, SPLITS))
     scenes, errors = label_figure(summary).axes
     assert [label.get_text() for label in scenes.get_yticklabels()] == ["hall (train)", "shed (test)", "all scenes"]
@@ -36,19 +32,19 @@ def test_label_figure_draws_shares_and_errors() -> None:
     assert sum(heights) == pytest.approx(100) and heights[-1] == pytest.approx(100 * summary.overall["without_pose"])
 
 
-def first_rows(scores: pd.DataFrame) -> pd.DataFrame:
+def first_rows(scores):
     rows = scores[(scores["scene"] == "all") & (scores["top_n"] == 1) & (scores["method"] != "oracle")]
     return rows.set_index("method").sort_values(f"normalized_{KEYS[0]}", ascending=False, kind="stable")
 
 
-def marks(axes: Any) -> dict[str, float]:
+def marks(axes):
     """Return the drawn value of each method by its label."""
     return {line.get_label(): line.get_xdata()[0] for line in axes.lines if len(line.get_xdata()) == 1}
 
 
-def test_score_figure_draws_the_best_methods_first() -> None:
+def test_score_figure_draws_the_best_methods_first():
     scores = make_scores(EVERY_METHOD, reference="")
-    figure: Any = score_figure(scores)
+    figure = score_figure(scores)
     rows = first_rows(scores)
     fisher = [name for name in rows.index if name in FISHER][:3]
     rows = rows.loc[[name for name in rows.index if name in fisher or not name.startswith("fisher")]]
@@ -60,7 +56,7 @@ def test_score_figure_draws_the_best_methods_first() -> None:
         np.testing.assert_allclose(whiskers, 100 * rows[[f"normalized_low_{key}", f"normalized_high_{key}"]])
 
 
-def test_regret_figure_draws_regret_and_difference() -> None:
+def test_regret_figure_draws_regret_and_difference():
     scores = make_scores()
     worse = make_scores(seed=1).assign(occlusion="none")  # of a second occlusion model, not drawn
     for axes, name in zip(regret_figure(pd.concat([scores, worse])).axes, ("regret", "difference"), strict=True):
@@ -69,11 +65,11 @@ def test_regret_figure_draws_regret_and_difference() -> None:
     assert len(regret_figure(make_scores(reference="")).axes) == 1
 
 
-def test_calibration_figure_draws_the_curves() -> None:
+def test_calibration_figure_draws_the_curves():
     rng = np.random.default_rng(0)
     probability = rng.random(500)
     table = calibration_rows(probability, rng.random(500) < probability, 2.0).assign(method="mlp-2d", temperature=2.0)
-    figure: Any = calibration_figure(table)
+    figure = calibration_figure(table)
     curve, counts = figure.axes
     for line, patch, when in zip(curve.lines[1:], counts.patches, ("before", "after"), strict=True):
         rows = table[table["when"] == when]
@@ -81,7 +77,7 @@ def test_calibration_figure_draws_the_curves() -> None:
         np.testing.assert_array_equal(patch.get_data().values, rows["n"])
 
 
-def test_overview_draws_locations_and_scores() -> None:
+def test_overview_draws_locations_and_scores():
     plan = dollhouse(furnished_room(), elevation_deg=90, cut_m=1.5, one_sided=False, width_px=240)
     locations = np.array([[1.0, 2.0, 1.4], [2.0, 3.0, 1.4], [3.0, 1.0, 1.4]])
     directions = fibonacci_sphere(80)

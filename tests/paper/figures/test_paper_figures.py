@@ -1,7 +1,5 @@
 """Figures of the paper that no item of the catalog draws from a store, and their geometry."""
 
-from __future__ import annotations
-
 import numpy as np
 import pandas as pd
 import pytest
@@ -17,7 +15,7 @@ from wheretolook_paper.figures.peaks import spread_extrema
 from wheretolook_paper.figures.runtimes import step_table
 
 
-def test_covering_radius_of_platonic_solids_and_lattices() -> None:
+def test_covering_radius_of_platonic_solids_and_lattices():
     octahedron = np.concatenate([np.eye(3), -np.eye(3)])
     assert covering_radius_deg(octahedron) == pytest.approx(np.degrees(np.arccos(1 / np.sqrt(3))))
     np.testing.assert_allclose(nearest_angles_deg(octahedron), 90)
@@ -28,7 +26,7 @@ def test_covering_radius_of_platonic_solids_and_lattices() -> None:
         assert searched == pytest.approx(covering_radius_deg(lattice(200)), rel=0.06)
 
 
-def test_extrema_are_spread() -> None:
+def test_extrema_are_spread():
     directions = fibonacci_sphere(300)
     scores = directions @ (0, 0, 1.0)
     peaks = spread_extrema(directions, scores, 4, 40.0)
@@ -38,7 +36,7 @@ def test_extrema_are_spread() -> None:
     assert spread_extrema(directions, scores, 1, 40.0, False).tolist() == [299]
 
 
-def test_a_story_of_views_is_a_figure_and_a_film() -> None:
+def test_a_story_of_views_is_a_figure_and_a_film():
     poses = poses_looking_along([[1.0, 1, 1]] * 2, [[1.0, 0, 0], [0, 1.0, 0]])
     good = Estimate(poses[:1], (np.ones((5, 2)),), 0.9, 0.01, 0.1)
     none = Estimate(None, (np.zeros((0, 2)),), 0.0, np.inf, np.inf)
@@ -50,7 +48,7 @@ def test_a_story_of_views_is_a_figure_and_a_film() -> None:
     assert len(story_figure(story, house).axes) == 3 + 4 and len([*film_frames(story, house)]) == 3
 
 
-def test_inference_steps_are_listed_below_the_papers() -> None:
+def test_inference_steps_are_listed_below_the_papers():
     about = {"threads": 2, "cores": 2, "device": "cpu", "name": "AMD EPYC", "landmarks": 24_919, "locations": 1}
     step = {"what": "mlp-2d+z, one pose", "directions": 1, "median_s": 3e-3, "q1_s": 2e-3, "q3_s": 5e-3, "min_s": 1e-3}
     check = {"what": "counts alone", "directions": 500, "median_s": 1.5}  # is no inference step

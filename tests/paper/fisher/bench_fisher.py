@@ -3,8 +3,6 @@
 python tests/paper/fisher/bench_fisher.py
 """
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 
@@ -22,15 +20,10 @@ from wheretolook.visibility.frustum import LandmarkSets, PosedViews
 from wheretolook_paper.fisher.exact import exact_information
 from wheretolook_paper.fisher.field import FisherField
 from wheretolook_paper.fisher.metrics import METRICS, metric_of
-from wheretolook_paper.fisher.soft_visibility import (
-    GaussianProcessVisibility,
-    QuadraticVisibility,
-    SoftVisibility,
-    cone_half_angle,
-)
+from wheretolook_paper.fisher.soft_visibility import GaussianProcessVisibility, QuadraticVisibility, cone_half_angle
 
 
-def main() -> None:
+def main():
     args = options(__doc__, landmarks=5000, samples=[10, 15, 20, 30, 50, 70, 100, 150])
     camera = PinholeCamera()
     points = room_landmarks(args.landmarks)
@@ -45,7 +38,7 @@ def main() -> None:
     print(f"{len(locations)} locations, {len(axes)} directions each, {len(points):,} landmarks, none hidden")
     print("factors  length  held-out RMSE  error of the matrix  exact metric at the chosen direction, % of the best")
     half_angle = cone_half_angle(camera)
-    visibilities: list[SoftVisibility] = [QuadraticVisibility(half_angle)]
+    visibilities = [QuadraticVisibility(half_angle)]
     visibilities += [GaussianProcessVisibility.fitted(half_angle, n) for n in args.samples]
     for visibility in visibilities:
         field = FisherField.build(locations, points, visibility)

@@ -1,7 +1,5 @@
 """Views of compared paths localized jointly: those of a stop, and the last views linked by odometry."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import numpy as np
@@ -36,7 +34,7 @@ METHODS = ("forward", "set", "set greedy")  # the last by another rule, which ha
 CONFIG = PathsConfig(methods=("forward", "set"), stops=StopConfig(2, 0.7), last_views=3, resamples=50)
 
 
-def seen(cam_from_world: np.ndarray, blind: np.ndarray, seed: int = 0) -> pd.DataFrame:
+def seen(cam_from_world, blind, seed=0):
     """What views (B, 3, 4) match, nothing right where they are blind, and what comes of localizing each alone."""
     rng = np.random.default_rng(seed)
     estimator = PoseEstimator(LANDMARKS.points)
@@ -60,7 +58,7 @@ def seen(cam_from_world: np.ndarray, blind: np.ndarray, seed: int = 0) -> pd.Dat
 
 
 @pytest.fixture(scope="module")
-def compared() -> tuple[ComparedPaths, pd.DataFrame, pd.DataFrame, pd.DataFrame]:
+def compared():
     """The same way by two methods, with a stop at the blind place of one; paths, further looks, and labels of both."""
     pose = poses_looking_along(POSITIONS, AXES)
     labels = pd.concat([seen(pose, np.arange(6) == BLIND, seed) for seed in (0, 1)], ignore_index=True)
@@ -77,7 +75,7 @@ def compared() -> tuple[ComparedPaths, pd.DataFrame, pd.DataFrame, pd.DataFrame]
     return ComparedPaths(paths, views), further, labels, seen(aside, np.array([False]))
 
 
-def test_joint_views_localize_where_a_single_view_does_not(compared: tuple) -> None:
+def test_joint_views_localize_where_a_single_view_does_not(compared):
     single, further, labels, further_labels = compared
     near = (single.views["status"] == "localized") & (single.views["error_m"] < 0.25)
     assert near.tolist() == [number % 6 != BLIND for number in range(18)]
@@ -104,7 +102,7 @@ def test_joint_views_localize_where_a_single_view_does_not(compared: tuple) -> N
     assert paths_figure(table.reset_index()).axes
 
 
-def test_odometry_without_noise_is_the_way_itself() -> None:
+def test_odometry_without_noise_is_the_way_itself():
     rng = np.random.default_rng(0)
     way = poses_looking_along(rng.uniform(-2, 2, (6, 3)), rng.normal(size=(6, 3)))
     steps = noisy_steps(way, 0.0, 0.0, rng)

@@ -1,7 +1,5 @@
 """Methods compared by paths between the same places."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -17,7 +15,7 @@ from wheretolook.planning.scene_map import shares_below
 from wheretolook.space.free_space import FreeSpace
 from wheretolook.utils.errors import PlanningError, SceneError
 from wheretolook_paper.paths.config import PathsConfig
-from wheretolook_paper.paths.path_comparison import ComparedPaths, Reachability, draw_pairs, plan_pairs
+from wheretolook_paper.paths.path_comparison import Reachability, draw_pairs, plan_pairs
 from wheretolook_paper.paths.path_report import summarize_paths
 
 QUICK = PathsConfig(
@@ -27,15 +25,15 @@ QUICK = PathsConfig(
 
 
 @pytest.fixture(scope="module")
-def space() -> FreeSpace:
+def space():
     return FreeSpace(furnished_room())
 
 
 @pytest.fixture(scope="module")
-def compared(space: FreeSpace) -> ComparedPaths:
+def compared(space):
     bins = shares_below(build(room_landmarks(200), directions=np.asarray(_lattice())))
 
-    def compare(seconds: float) -> ComparedPaths:
+    def compare(seconds):
         config = replace(QUICK, planner=replace(QUICK.planner, time_s=seconds))
         found = plan_pairs(draw_pairs(space, config), space, {"bins": bins}, config)
         if not found.paths["planned"].all():
@@ -45,13 +43,13 @@ def compared(space: FreeSpace) -> ComparedPaths:
     return patiently(compare)
 
 
-def _lattice() -> np.ndarray:
+def _lattice():
     from wheretolook.geometry.lattices import direction_lattice
 
     return direction_lattice(200)
 
 
-def test_pairs_are_far_apart_and_free(space: FreeSpace) -> None:
+def test_pairs_are_far_apart_and_free(space):
     pairs = draw_pairs(space, replace(QUICK, pairs=3))
     assert pairs.shape == (3, 2, 3) and space.is_free(pairs.reshape(-1, 3)).all()
     assert (np.linalg.norm(pairs[:, 1] - pairs[:, 0], axis=1) >= 1.5).all()
@@ -62,13 +60,13 @@ def test_pairs_are_far_apart_and_free(space: FreeSpace) -> None:
         draw_pairs(space, replace(QUICK, min_distance_m=50.0))
 
 
-def test_ways_lead_round_walls_but_not_through_them() -> None:
+def test_ways_lead_round_walls_but_not_through_them():
     class Rooms:
         """Two rooms, and a door between them or not."""
 
         bounds = np.array([[0.0, 0.0, 0.0], [4.0, 2.0, 1.0]])
 
-        def __init__(self, door: bool) -> None:
+        def __init__(self, door):
             self.door = door
 
         def is_free(self, points):
@@ -91,7 +89,7 @@ def test_ways_lead_round_walls_but_not_through_them() -> None:
     assert not closed.connects(left, (2.0, 0.5, 0.5))  # in the wall
 
 
-def test_every_method_goes_the_same_way(compared: ComparedPaths, space: FreeSpace) -> None:
+def test_every_method_goes_the_same_way(compared, space):
     paths = compared.paths
     assert paths["planned"].all()
     assert {*zip(paths["task"], paths["method"], strict=True)} == {
@@ -113,7 +111,7 @@ def test_every_method_goes_the_same_way(compared: ComparedPaths, space: FreeSpac
         assert given.loc[(pair, "bins"), "length_m"] == given.loc[(pair, "forward"), "length_m"]
 
 
-def _labelled() -> tuple[pd.DataFrame, pd.DataFrame]:
+def _labelled():
     """Two pairs: forward localizes 1 of 4 and 2 of 4 views, ours 4 of 5 and 1 of 5; on the third ours found no way."""
     paths = []
     views = []
@@ -130,7 +128,7 @@ def _labelled() -> tuple[pd.DataFrame, pd.DataFrame]:
     return pd.DataFrame(paths), pd.DataFrame(views)
 
 
-def test_shares_by_hand() -> None:
+def test_shares_by_hand():
     paths, views = _labelled()
     table = summarize_paths(paths, views, QUICK).set_index("method")
     assert table.loc["forward", "localized"] == pytest.approx(3 / 10)

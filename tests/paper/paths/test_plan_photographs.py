@@ -1,9 +1,5 @@
 """Paths on a map of photographs: a rendered room, seen from a ring of cameras that face across it."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import numpy as np
 import pandas as pd
 import pytest
@@ -18,7 +14,7 @@ from wheretolook_paper.figures.photograph_paths import AXIS, LANDMARKS_CSV, PATH
 from wheretolook_paper.studies.plan_photographs import farthest_ends, main, nearest_photographs, write_rows
 
 
-def test_the_nearest_photograph_weighs_the_angle_against_the_distance_in_depths() -> None:
+def test_the_nearest_photograph_weighs_the_angle_against_the_distance_in_depths():
     forward = np.array([0.0, 1.0, 0.0])
     turned = np.array([np.sin(0.3), np.cos(0.3), 0.0])
     poses = poses_looking_along([(0, 0, 1), (1, 0, 1), (0, 0, 1)], [turned, forward, -forward])
@@ -29,7 +25,7 @@ def test_the_nearest_photograph_weighs_the_angle_against_the_distance_in_depths(
     assert (row, distance_m) == (1, 1) and angle_deg == pytest.approx(0, abs=1e-6)
 
 
-def test_ends_are_the_farthest_photographs_that_free_space_connects() -> None:
+def test_ends_are_the_farthest_photographs_that_free_space_connects():
     """Three cameras along a line, and two farther ones behind a wall of landmarks."""
     centers = np.array([(0, 0, 1), (1, 0, 1), (2, 0, 1), (3.2, 0, 1), (4.2, 0, 1)], dtype=float)
     y, z = np.meshgrid(np.arange(-3, 3, 0.1), np.arange(-2, 4, 0.1))
@@ -40,7 +36,7 @@ def test_ends_are_the_farthest_photographs_that_free_space_connects() -> None:
         farthest_ends(MappedSpace(wall, centers), centers, 0.5)
 
 
-def test_rows_of_other_scenes_are_kept(tmp_path: Path) -> None:
+def test_rows_of_other_scenes_are_kept(tmp_path):
     file = tmp_path / "table.csv"
     for scene, value in (("b", 1), ("a", 2), ("b", 3)):
         write_rows(pd.DataFrame({"scene": [scene], "value": [value]}), file, 2)
@@ -48,7 +44,7 @@ def test_rows_of_other_scenes_are_kept(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_paths_through_a_rendered_room(tmp_path: Path) -> None:
+def test_paths_through_a_rendered_room(tmp_path):
     write_rendered_room(tmp_path)
     photographs = tmp_path / "photographs"
     model, database = features_of(tmp_path / "sparse", photographs, None, tmp_path / "mapped", 1, "cpu")

@@ -1,7 +1,5 @@
 """Fisher information as a way to choose views: where it must look, and what the scorers share."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from twins.fisher import eigenvalues_plain
@@ -9,39 +7,39 @@ from twins.fisher import eigenvalues_plain
 from synthetic_dataset import make_landmarks
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.lattices import fibonacci_sphere
-from wheretolook.geometry.poses import Float, camera_centers, poses_looking_along
+from wheretolook.geometry.poses import camera_centers, poses_looking_along
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.visibility.frustum import LandmarkSets, PosedViews
 from wheretolook.visibility.occlusion import StoredOcclusion
 from wheretolook_paper.fisher.exact import exact_information_plain
 from wheretolook_paper.fisher.metrics import METRICS, metric_of_eigenvalues
-from wheretolook_paper.scorers.fisher import APPROXIMATIONS, Approximation
+from wheretolook_paper.scorers.fisher import APPROXIMATIONS
 from wheretolook_paper.scorers.fisher.score import FisherScorer, StationaryTraceScorer, WorstTraceScorer
 
 CAMERA = PinholeCamera()
 DIRECTIONS = fibonacci_sphere(300)
 
 
-def with_points(points: Float) -> Landmarks:
+def with_points(points):
     landmarks = make_landmarks(np.random.default_rng(0), len(points))
     return Landmarks(**{**vars(landmarks), "points": points})
 
 
-def two_walls(rng: np.random.Generator, n: int = 1500) -> Landmarks:
+def two_walls(rng, n=1500):
     """Landmarks on the walls x = 4 and y = 4 of a room of 8 m x 8 m x 2.6 m."""
     points = rng.uniform((-4, -4, 0), (4, 4, 2.6), (n, 3))
     points[np.arange(n), rng.integers(0, 2, n)] = 4
     return with_points(points)
 
 
-def views_at(locations: Float, directions: Float = DIRECTIONS) -> Float:
+def views_at(locations, directions=DIRECTIONS):
     return poses_looking_along(np.repeat(locations, len(directions), 0), np.tile(directions, (len(locations), 1)))
 
 
 @pytest.mark.parametrize("metric", METRICS)
 @pytest.mark.parametrize("approximation", APPROXIMATIONS)
-def test_of_a_room_with_landmarks_on_two_walls_it_looks_at_them(metric: str, approximation: Approximation) -> None:
+def test_of_a_room_with_landmarks_on_two_walls_it_looks_at_them(metric, approximation):
     rng = np.random.default_rng(1)
     localization_map = LocalizationMap(two_walls(rng), CAMERA)
     hits = 0
@@ -58,7 +56,7 @@ def test_of_a_room_with_landmarks_on_two_walls_it_looks_at_them(metric: str, app
 
 
 @pytest.mark.parametrize("about_origin", [False, True])
-def test_exact_scores_are_metrics_of_the_sums(about_origin: bool) -> None:
+def test_exact_scores_are_metrics_of_the_sums(about_origin):
     rng = np.random.default_rng(3)
     landmarks = two_walls(rng, 400)
     locations = rng.uniform((-3, -3, 0.8), (2, 2, 1.8), (4, 3))
@@ -74,7 +72,7 @@ def test_exact_scores_are_metrics_of_the_sums(about_origin: bool) -> None:
         assert np.ptp(scores) > 0.1
 
 
-def test_probes_look_away_from_the_landmarks() -> None:
+def test_probes_look_away_from_the_landmarks():
     rng = np.random.default_rng(5)
     localization_map = LocalizationMap(two_walls(rng), CAMERA)
     locations = rng.uniform((-3, -3, 0.8), (2, 2, 1.8), (5, 3))

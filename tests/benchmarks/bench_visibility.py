@@ -15,7 +15,6 @@ import gc
 import json
 import platform
 import resource
-import sys
 import threading
 import time
 from functools import partial
@@ -170,7 +169,6 @@ def paper_size(args, device):
     add("cells of the sphere (once)", 1, lambda: FrustumCounter(CAMERA, rotations, len(setup.points), device))
     some = setup.locations[setup.rng.choice(len(setup.locations), args.twin_locations, replace=False)]
     everything = np.ones((len(some), len(setup.points)), dtype=bool)
-    sys.path.append(str(Path(__file__).parents[1]))
     from twins.visibility import count_plain
 
     twin = partial(count_plain, CAMERA, rotations, some, setup.points, everything)

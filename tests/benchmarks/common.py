@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
-import pycolmap
 import torch
 
 from wheretolook.geometry.camera import PinholeCamera
@@ -22,6 +22,8 @@ from wheretolook.scenes.loading import load_mesh, save_glb
 from wheretolook.space.free_space import FreeSpace
 from wheretolook.visibility.occlusion import StoredOcclusion
 from wheretolook_rooms.generator import generate_apartment
+
+sys.path.append(str(Path(__file__).parents[1]))
 
 ROOM_M = ((-5.0, -4.0, 0.0), (5.0, 4.0, 2.6))
 SIDE_M = 20.0  # of the building of `write_model`
@@ -153,31 +155,18 @@ def open_scene(source, folder, seed, device):
 
 def write_model(folder, n):
     """Write a COLMAP model of n landmarks on the walls of a building of rooms, seen by 200 images of a pinhole."""
+    from colmap_models import colmap_model
+
     rng = np.random.default_rng(0)
     points = rng.uniform((0, 0, 0), (SIDE_M, SIDE_M, HEIGHT_M), (n, 3))
     points[np.arange(n), rng.integers(0, 2, n)] = 5.0 * rng.integers(0, 5, n)
-    model = pycolmap.Reconstruction()
-    camera = pycolmap.Camera(model="PINHOLE", width=640, height=480, params=[320, 320, 320, 240], camera_id=1)
-    model.add_camera_with_trivial_rig(camera)
     centers = rng.uniform((1, 1, 1), (SIDE_M - 1, SIDE_M - 1, 2), (200, 3))
     poses = poses_looking_along(centers, rng.normal(size=(200, 3)) * (1, 1, 0.2))
+    seen = np.zeros((200, n), dtype=bool)
     nearest = np.argsort(np.linalg.norm(points[:, None] - centers[None], axis=2), axis=1)
-    tracks = [pycolmap.Track() for _ in points]
-    n_observed = np.zeros(len(centers), dtype=int)
-    for track, images in zip(tracks, nearest[:, :4], strict=True):
-        for image in np.sort(images):
-            track.add_element(int(image) + 1, int(n_observed[image]))
-            n_observed[image] += 1
-    for number, pose in enumerate(poses):
-        keypoints = np.full((n_observed[number], 2), 100.0)
-        image = pycolmap.Image(name=f"{number:04}.jpg", keypoints=keypoints, camera_id=1, image_id=number + 1)
-        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pose))
-    for point, track in zip(points, tracks, strict=True):
-        model.add_point3D(point, track, np.zeros(3, dtype=np.uint8))
-    for point in model.points3D.values():
-        point.error = 0.4
+    seen[nearest[:, :4].T, np.arange(n)] = True
     folder.mkdir(parents=True, exist_ok=True)
-    model.write(str(folder))
+    colmap_model(points, poses, seen, (PinholeCamera(640, 480, 320.0),), False, 0.4).write(str(folder))
 
 
 def waypoints(n):

@@ -19,11 +19,11 @@ from nav_msgs.msg import Path as PathMessage
 from rclpy.node import Node
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, JointState
 from trajectory_msgs.msg import JointTrajectory
-from wheretolook_ros.conversions import pose_message
+from wheretolook_ros.conversions import pose_matrix, pose_message
 from wheretolook_ros.head import Head
 
 from wheretolook.geometry.camera import PinholeCamera
-from wheretolook.geometry.poses import compose_poses, invert_poses
+from wheretolook.geometry.poses import compose_poses, invert_poses, pose_error
 
 ROOT = Path(__file__).parents[2]
 HEAD = Head((0.1, 0.0, 1.2, 0.0, 0.0, 0.0))
@@ -111,6 +111,20 @@ class Robot(Node):
     def last(self, topic):
         """The last message of a topic, None without."""
         return next((message for name, message in reversed(self.received) if name == topic), None)
+
+    def published(self, topic):
+        """Wait for a message of a topic, and return the last one."""
+        return self.wait(lambda: self.last(topic), topic)
+
+    def reported(self, text, node="visual_localization"):
+        """Wait until the diagnostics of a node hold a text."""
+        self.wait(lambda: any(text in status.message for status in self.statuses(node)), text)
+
+    def localized(self, base, error_m=0.02, error_deg=0.3):
+        """Assert that the published pose of the base is right."""
+        found = pose_matrix(self.published("visual_localization/pose").pose.pose)
+        position, angle = pose_error(invert_poses(found), invert_poses(base))
+        assert position < error_m and angle < error_deg, (position, angle)
 
     def status(self, node="visual_localization"):
         """The last diagnostics of a node."""

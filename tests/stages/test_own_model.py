@@ -10,6 +10,7 @@ import pytest
 
 from all_options import AllOptions, run
 from box_scenes import box_quads, quads_mesh, random_texture
+from colmap_models import colmap_model
 from mapping.marker_rooms import CAMERA, MARKERS, hand_held_poses, marker_room, take_photographs
 from wheretolook.cli import main
 from wheretolook.commands.label import Label
@@ -22,7 +23,7 @@ from wheretolook.dataset.layout import Dataset, SceneFolder
 from wheretolook.dataset.sampling_config import SampleConfig
 from wheretolook.features.config import ExtractorConfig
 from wheretolook.geometry.camera import CameraConfig, PinholeCamera
-from wheretolook.geometry.poses import camera_centers, poses_looking_along
+from wheretolook.geometry.poses import camera_centers, poses_looking_along, transform
 from wheretolook.io.poses import read_poses
 from wheretolook.mapping.colmap_model import colmap_poses, read_model
 from wheretolook.mapping.config import ExistingModelConfig, FrameOptions, MapConfig, MarkerConfig, PhotographsConfig
@@ -43,34 +44,17 @@ def empty_room():
     return quads_mesh(box_quads((0, 0, 0), SIZE, inward=True), [random_texture(np.random.default_rng(0), 64, 64)])
 
 
-def room_model(n_points=800, cameras=(LOOKS,)):
+def room_model(cameras=(LOOKS,)):
     """Return a model of points on the walls of a room of `SIZE`, seen from 36 poses at a height of 1.4 m."""
     rng = np.random.default_rng(0)
-    model = pycolmap.Reconstruction()
-    points = rng.uniform((0, 0, 0), SIZE, (n_points, 3))
-    wall = rng.integers(0, 2, n_points)  # which axis
-    points[np.arange(n_points), wall] = rng.integers(0, 2, n_points) * np.array(SIZE)[wall]
+    points = rng.uniform((0, 0, 0), SIZE, (800, 3))
+    wall = rng.integers(0, 2, 800)  # which axis
+    points[np.arange(800), wall] = rng.integers(0, 2, 800) * np.array(SIZE)[wall]
     angle = np.linspace(0, 2 * np.pi, 36, endpoint=False)
     centers = np.array([3.0, 2.5, 1.4]) + np.column_stack([1.6 * np.cos(angle), 1.2 * np.sin(angle), 0 * angle])
     poses = poses_looking_along(centers, np.column_stack([np.cos(3 * angle), np.sin(3 * angle), 0 * angle]))
-    for number, camera in enumerate(cameras, 1):
-        model.add_camera_with_trivial_rig(pycolmap.Camera(camera_id=number, **camera.colmap.record()))
-    tracks = [pycolmap.Track() for _ in points]
-    for index, pose in enumerate(poses):
-        number = index % len(cameras)
-        in_camera = points @ pose[:, :3].T + pose[:, 3]
-        pixels = cameras[number].project(in_camera)
-        rows = np.flatnonzero((in_camera[:, 2] > 0) & cameras[number].in_image(pixels))
-        image = pycolmap.Image(
-            name=f"{index:03d}.jpg", camera_id=number + 1, image_id=index + 1, keypoints=pixels[rows]
-        )
-        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pose))
-        for keypoint, row in enumerate(rows):
-            tracks[row].add_element(index + 1, keypoint)
-    for point, track in zip(points, tracks, strict=True):
-        if track.length() >= 2:
-            model.add_point3D(point, track)
-    return model
+    seen = [cameras[k % len(cameras)].sees(transform(pose, points)) for k, pose in enumerate(poses)]
+    return colmap_model(points, poses, seen, cameras)
 
 
 def save(model, folder):

@@ -6,10 +6,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from paper.matched_views import matched_views
 from planning.rooms import CAMERA, room_landmarks
 from wheretolook.dataset.viewpoint_table import pose_columns
-from wheretolook.geometry.poses import pose_error, poses_looking_along
-from wheretolook.localization.estimation import PoseEstimator
+from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.planning.config import StopConfig
 from wheretolook_paper.evaluation.joint_labels import label_sets
 from wheretolook_paper.figures.paths import paths_figure
@@ -35,26 +35,9 @@ CONFIG = PathsConfig(methods=("forward", "set"), stops=StopConfig(2, 0.7), last_
 
 
 def seen(cam_from_world, blind, seed=0):
-    """What views (B, 3, 4) match, nothing right where they are blind, and what comes of localizing each alone."""
-    rng = np.random.default_rng(seed)
-    estimator = PoseEstimator(LANDMARKS.points)
-    rows = []
-    for pose, wrong in zip(cam_from_world, blind, strict=True):
-        there = LANDMARKS.points @ pose[:, :3].T + pose[:, 3]
-        at = CAMERA.project(there)
-        visible = np.flatnonzero((there[:, 2] > 0.1) & CAMERA.in_image(at))
-        visible = np.sort(rng.choice(visible, min(40, len(visible)), replace=False))
-        pixels = rng.uniform((0, 0), (160, 120), (len(visible), 2)) if wrong else at[visible]
-        pixels = (pixels + rng.normal(0, 0.2, pixels.shape)).astype(np.float32)
-        found = estimator.estimate(pixels, visible, CAMERA)
-        inliers = 0 if found is None else int(found[1].sum())
-        error_m, error_deg = (np.nan, np.nan) if found is None else pose_error(found[0], pose)
-        status = "localized" if inliers >= 10 else "no_pose"
-        matched = {"matched_rows": visible.astype(np.int32), "matched_pixels": pixels.ravel(), "location_id": len(rows)}
-        rows.append(
-            {"status": status, "error_m": float(error_m), "error_deg": float(error_deg), "n_inliers": inliers} | matched
-        )
-    return pd.DataFrame(rows).assign(**pose_columns(cam_from_world))
+    """Return the labels of views (B, 3, 4), which match nothing right where they are blind."""
+    labels = matched_views(LANDMARKS.points, CAMERA, cam_from_world, blind, seed)
+    return labels.assign(location_id=range(len(labels)))
 
 
 @pytest.fixture(scope="module")

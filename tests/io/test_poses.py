@@ -6,17 +6,17 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from wheretolook.geometry.poses import camera_centers, invert_poses, poses_looking_along, quaternion_from_rotation
-from wheretolook.io.poses import (
+from wheretolook.geometry.pose_files import (
     MAX_ROWS,
     POSE_COLUMNS,
     pose_texts,
     pose_values,
     poses_of_values,
-    read_poses,
     read_rows,
     tum_text,
 )
+from wheretolook.geometry.poses import camera_centers, invert_poses, poses_looking_along, quaternion_from_rotation
+from wheretolook.geometry.views import Views
 from wheretolook.mapping.georeference import read_positions
 from wheretolook.select.waypoints import read_waypoints
 from wheretolook.utils.errors import ConfigError, TableError
@@ -35,9 +35,9 @@ def test_round_trips(tmp_path):
     first, second = pose_texts(POSES)
     (tmp_path / "images.txt").write_text(f"# comment\n1 {first} 1 a.jpg\n\n" + image.format(second))
     for name in ("path.tum", "path.csv", "views.csv", "poses.csv", "images.txt"):
-        np.testing.assert_allclose(read_poses(tmp_path / name).cam_from_world, POSES, atol=1e-8)
-    assert read_poses(tmp_path / "images.txt").names == ("a.jpg", "a b.jpg")
-    assert read_poses(tmp_path / "path.tum").names == ("0.5", "1")
+        np.testing.assert_allclose(Views.read(tmp_path / name).cam_from_world, POSES, atol=1e-8)
+    assert Views.read(tmp_path / "images.txt").waypoint_id == ("a.jpg", "a b.jpg")
+    assert Views.read(tmp_path / "path.tum").waypoint_id == ("0.5", "1")
 
 
 @pytest.mark.parametrize("time", ["t", "timestamp", None])
@@ -46,7 +46,8 @@ def test_header_in_the_order_of_tum(time, tmp_path):
     names, values = "tx,ty,tz,qx,qy,qz,qw", "1,2,3,-0.5,0.5,-0.5,0.5"
     path = tmp_path / "path.csv"
     path.write_text(f"{names}\n{values}\n" if time is None else f"{time},{names}\n0.5,{values}\n")
-    ids, poses = read_poses(path)
+    views = Views.read(path)
+    ids, poses = views.waypoint_id, views.cam_from_world
     assert ids == ("0" if time is None else "0.5",)
     np.testing.assert_allclose(poses, poses_looking_along([(1, 2, 3)], [(1, 0, 0)]), atol=1e-12)
     assert read_waypoints(path).points.tolist() == [[1, 2, 3]]
@@ -55,7 +56,7 @@ def test_header_in_the_order_of_tum(time, tmp_path):
 @pytest.mark.parametrize("names", ["tx,ty,tz,qw,qx,qy,qz", "qx,qy,qz,qw,tx,ty,tz"])
 def test_header_in_an_order_of_no_convention(names, tmp_path):
     (tmp_path / "path.csv").write_text(f"{names}\n0.5,0.5,0.5,0.5,0.5,0.5,0.5\n")
-    for read in (read_poses, read_waypoints):
+    for read in (Views.read, read_waypoints):
         with pytest.raises(TableError, match=r"TUM.*camera-to-world.*COLMAP.*world-to-camera"):
             read(tmp_path / "path.csv")
 
@@ -79,7 +80,7 @@ def test_large_tables_are_rejected_without_reading_them(tmp_path):
     with pytest.raises(TableError):
         read_rows(path)
     os.truncate(path, 2_000_000_000)
-    for read in (read_rows, read_poses, read_waypoints, read_positions):
+    for read in (read_rows, Views.read, read_waypoints, read_positions):
         with pytest.raises((TableError, ConfigError), match="16,000,000 bytes"):
             read(path)
 
@@ -106,4 +107,4 @@ def test_invalid_files(content, tmp_path):
     for name in ("path.tum", "path.csv", "images.txt"):
         (tmp_path / name).write_bytes(content)
         with pytest.raises(TableError):
-            read_poses(str(tmp_path / name))
+            Views.read(str(tmp_path / name))

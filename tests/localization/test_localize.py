@@ -13,7 +13,7 @@ from localization.rooms import CAMERA
 from wheretolook.cli import main
 from wheretolook.geometry.poses import pose_error, poses_looking_along
 from wheretolook.geometry.similarity import Similarity
-from wheretolook.io.poses import read_poses
+from wheretolook.geometry.views import Views
 from wheretolook.localization.rig import checked_turns, read_turns
 from wheretolook.mapping.colmap_model import read_model
 from wheretolook.mapping.config import FrameOptions
@@ -75,16 +75,16 @@ def test_images_of_the_same_name_in_two_folders_are_distinct(room, photos, tmp_p
         (tmp_path / "rig" / folder / "1.png").write_bytes((photos / f"{name}.png").read_bytes())
     command = ["localize", str(tmp_path / "rig"), "--map", str(room.landmarks.parent)]
     assert main([*command, "--out", str(tmp_path / "images.txt"), "--figure", str(tmp_path / "figures")]) == 0
-    found = read_poses(tmp_path / "images.txt")
-    assert found.names == ("left/1.png", "right/1.png")
+    found = Views.read(tmp_path / "images.txt")
+    assert found.waypoint_id == ("left/1.png", "right/1.png")
     assert_near(found.cam_from_world, POSES[:2])
-    assert all((tmp_path / "figures" / name).is_file() for name in found.names)
+    assert all((tmp_path / "figures" / name).is_file() for name in found.waypoint_id)
     turns = tmp_path / "turns.csv"
     yaw = np.degrees(np.arctan2(AXES[:, 1], AXES[:, 0]))
     turns.write_text(f"image,yaw,pitch\nright/1.png,{yaw[1]},5.47\nleft/1.png,{yaw[0]},0\n")
     assert main([*command, "--turns", str(turns), "--out", str(tmp_path / "images.txt")]) == 0
-    found = read_poses(tmp_path / "images.txt")
-    assert found.names == ("left/1.png", "right/1.png")
+    found = Views.read(tmp_path / "images.txt")
+    assert found.waypoint_id == ("left/1.png", "right/1.png")
     assert_near(found.cam_from_world, POSES[:2])
 
 

@@ -13,8 +13,8 @@ from wheretolook import LocalizationMap, load_scorer, poses_looking_along
 from wheretolook import WhereToLook as Exported
 from wheretolook.geometry.camera import ColmapCamera, PinholeCamera
 from wheretolook.geometry.lattices import direction_lattice
+from wheretolook.geometry.pose_files import images_text, tum_text
 from wheretolook.geometry.poses import rotation_angle_deg, rotation_looking_along
-from wheretolook.io.poses import images_text, tum_text
 from wheretolook.mapping.depth_images import read_depth_images
 from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.scenes.loading import save_glb

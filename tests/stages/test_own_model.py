@@ -24,7 +24,7 @@ from wheretolook.dataset.sampling_config import SampleConfig
 from wheretolook.features.config import ExtractorConfig
 from wheretolook.geometry.camera import CameraConfig, PinholeCamera
 from wheretolook.geometry.poses import camera_centers, poses_looking_along, transform
-from wheretolook.io.poses import read_poses
+from wheretolook.geometry.views import Views
 from wheretolook.mapping.colmap_model import colmap_poses, read_model
 from wheretolook.mapping.config import ExistingModelConfig, FrameOptions, MapConfig, MarkerConfig, PhotographsConfig
 from wheretolook.mapping.imported_map import map_existing
@@ -119,7 +119,7 @@ def test_one_command_plans_a_path_in_the_folder_of_a_model(tmp_path, capsys, uni
     assert main(["plan", *where, "--start", str(start), "--goal", str(goal), *lattice.split(), *out]) == 0
     path = pd.read_csv(tmp_path / "way" / "path.csv")
     np.testing.assert_allclose(path.iloc[[0, -1], :3], [start, goal], atol=1e-6)
-    centers = camera_centers(read_poses(tmp_path / "way" / "path.csv").cam_from_world)
+    centers = camera_centers(Views.read(tmp_path / "way" / "path.csv").cam_from_world)
     np.testing.assert_allclose(centers, path.iloc[:, :3], atol=1e-5)
     assert "320 x 240" in capsys.readouterr().out  # the model's camera
     lattice = "--method=visible --viewpoint-map.grid=[6,5,3] --viewpoint-map.directions=30"

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from wheretolook.io.depth import read_depth
+from wheretolook.mapping.depth_images import read_depth
 from wheretolook.mapping.photographs import read_photograph
 from wheretolook.utils.errors import MapError
 from wheretolook.utils.files import image_size, read_image

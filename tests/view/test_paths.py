@@ -10,8 +10,8 @@ import pytest
 
 from selection.room import POINTS
 from wheretolook.dataset.viewpoint_table import pose_columns
+from wheretolook.geometry.pose_files import tum_text
 from wheretolook.geometry.poses import camera_centers, poses_looking_along
-from wheretolook.io.poses import tum_text
 from wheretolook.planning.config import FORWARD
 from wheretolook.utils.errors import ConfigError, TableError
 from wheretolook.view.state import ViewState, looking_ahead, read_paths

@@ -18,7 +18,7 @@ from wheretolook.utils.errors import ConfigError, MapWarning, check_choice
 
 if TYPE_CHECKING:
     from wheretolook.geometry.camera import Camera
-    from wheretolook.select.views import SelectedViews
+    from wheretolook.geometry.views import Views
     from wheretolook.select.waypoints import Waypoints
     from wheretolook.select.where_to_look import WhereToLook
 
@@ -108,7 +108,7 @@ class SelectorOptions(CameraOptions, OcclusionOptions, ScorerOptions, FrameOptio
         return selector if self.accuracy is None else selector.at_accuracy(self.accuracy)
 
 
-def finish(command: SelectorOptions, selector: WhereToLook, views: SelectedViews, given: int, locations: str) -> None:
+def finish(command: SelectorOptions, selector: WhereToLook, views: Views, given: int, locations: str) -> None:
     """Write views and the floor plan, and print a summary; `locations` names the kind of what was `given`."""
     views.save(command.out, command.format)
     if command.floor_plan is not None:
@@ -196,7 +196,7 @@ class Select(SelectionRequest, SelectorOptions):
     lattice: Literal["fibonacci", "yaw-pitch"] = "fibonacci"
 
     def __post_init__(self) -> None:
-        from wheretolook.select.views import check_format
+        from wheretolook.geometry.views import check_format
 
         SelectionRequest.__post_init__(self)
         SelectorOptions.__post_init__(self)
@@ -206,7 +206,7 @@ class Select(SelectionRequest, SelectorOptions):
         if bool(self.at) == (self.grid is not None):
             raise ConfigError("waypoints are given by either --at or --grid")
 
-    def run(self) -> SelectedViews:
+    def run(self) -> Views:
         """Select the views, write them to `out` and print a summary."""
         start = time.monotonic()
         waypoints = self._waypoints()
@@ -257,23 +257,23 @@ class Score(SelectorOptions):
     skip: bool = False
 
     def __post_init__(self) -> None:
-        from wheretolook.select.views import check_format
+        from wheretolook.geometry.views import check_format
 
         super().__post_init__()
         check_format(self.out, self.format, 1)
 
-    def run(self) -> SelectedViews:
+    def run(self) -> Views:
         """Score the poses, write them to `out` and print a summary."""
-        from wheretolook.io.poses import read_poses
+        from wheretolook.geometry.views import Views
 
-        names, cam_from_world = read_poses(self.poses)
+        poses = Views.read(self.poses)
         selector = self.open_map()
-        views = selector.report(cam_from_world, names, self.skip)
+        views = selector.report(poses.cam_from_world, poses.waypoint_id, self.skip)
         if (views.pitch_deg > BODY_PITCH_DEG).all():
             text = (
                 "every camera looks up; are these a robot's orientations, x ahead and z up? Give its camera's, z ahead"
             )
             warnings.warn(f"{self.poses}: {text} and y down", MapWarning, stacklevel=2)
-        finish(self, selector, views, len(names), "poses")
+        finish(self, selector, views, len(poses), "poses")
         print(f"scores: {self.out}")
         return views

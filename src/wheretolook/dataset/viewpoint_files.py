@@ -14,8 +14,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from wheretolook.dataset.viewpoint_table import APPEARANCE, CAMERA_ID, CHANGES, FIRST, LABELS, PIXELS, poses
+from wheretolook.geometry.pose_files import POSE_COLUMNS, QUATERNION_COLUMNS, TRANSLATION_COLUMNS
 from wheretolook.geometry.poses import Float, camera_centers, rotation_from_quaternion
-from wheretolook.io.poses import POSE_COLUMNS, QUATERNION_COLUMNS, TRANSLATION_COLUMNS
 from wheretolook.utils.errors import TableError
 from wheretolook.utils.files import atomic_write, open_parquet
 

@@ -14,8 +14,8 @@ from wheretolook.dataset.config import LOCALIZED as LOCALIZED
 from wheretolook.dataset.config import NO_POSE as NO_POSE
 from wheretolook.dataset.config import TOO_FEW_MATCHES as TOO_FEW_MATCHES
 from wheretolook.dataset.sampling_config import Split
+from wheretolook.geometry.pose_files import POSE_COLUMNS, pose_values, poses_of_values
 from wheretolook.geometry.poses import Float, camera_centers
-from wheretolook.io.poses import POSE_COLUMNS, pose_values, poses_of_values
 from wheretolook.utils.errors import TableError
 
 CAMERA_ID = "camera_id"  # optional column

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.poses import Float, split_poses
+from wheretolook.geometry.views import Views
 from wheretolook.inputs.channels import ATTRIBUTES
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.landmarks import MAP_ATTRIBUTES
@@ -158,16 +159,6 @@ REPEATED = 0.95  # cosine between the descriptor and the nearest one of another 
 """Limits of a landmark, beyond which the bundled weights expect it to be detected about half as often, or less."""
 
 
-@dataclass(frozen=True, eq=False)
-class ReasonCounts:
-    """Numbers of landmarks that are hard to match in B views; a landmark may have several reasons."""
-
-    n_occluded: NDArray[np.int64]  # (B,) in the image, but behind something
-    n_too_far: NDArray[np.int64]  # (B,) of the visible ones
-    n_too_oblique: NDArray[np.int64]  # (B,) of the visible ones
-    n_repeated: Float  # (B,) of the visible ones; NaN for a map without descriptors
-
-
 class ReasonCounter:
     """Counts the landmarks of a map that are hard to match in views of it, by reason."""
 
@@ -177,8 +168,8 @@ class ReasonCounter:
         self._describer = LandmarkDescriber(localization_map, ("distance_ratio", "mapped_angle", "ambiguity"))
         self._has_descriptors = bool(np.isfinite(localization_map.landmarks.ambiguity).any())
 
-    def count(self, cam_from_world: Float) -> ReasonCounts:
-        """Count for poses (B, 3, 4)."""
+    def count(self, cam_from_world: Float) -> Views:
+        """Return views with poses (B, 3, 4) and these numbers; a landmark may have several reasons."""
         n_occluded = np.zeros(len(cam_from_world), dtype=np.int64)
         if self._unoccluded is not None:
             starts, _ = self._unoccluded.in_view_on_device(cam_from_world)
@@ -193,4 +184,10 @@ class ReasonCounter:
             sums = torch.segment_reduce(hard, "sum", lengths=described.counts, axis=0, initial=0.0)
             counts[rows] = sums.cpu().numpy()
         too_far, too_oblique, repeated = counts.T
-        return ReasonCounts(n_occluded, too_far, too_oblique, repeated * (1.0 if self._has_descriptors else np.nan))
+        return Views(
+            cam_from_world,
+            n_occluded=n_occluded,
+            n_too_far=too_far,
+            n_too_oblique=too_oblique,
+            n_repeated=repeated * (1.0 if self._has_descriptors else np.nan),
+        )

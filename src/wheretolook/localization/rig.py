@@ -12,9 +12,9 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from wheretolook.geometry.camera import Camera, field_of_view_deg
+from wheretolook.geometry.pose_files import NAME_COLUMNS, QUATERNION_COLUMNS, NamedRows, poses_of_rows, read_named_rows
 from wheretolook.geometry.poses import Float, as_numbers, camera_centers, compose_poses, invert_poses, rigid_poses
 from wheretolook.geometry.similarity import Similarity
-from wheretolook.io.poses import NAME_COLUMNS, QUATERNION_COLUMNS, NamedRows, poses_of_rows, read_named_rows
 from wheretolook.utils.errors import ConfigError, PoseError, TableError
 from wheretolook.utils.files import path_ends
 
@@ -139,7 +139,7 @@ def read_turns(path: Path, images: Sequence[str]) -> Float:
 def _poses(table: NamedRows) -> Float:
     """Return cam_from_rig (R, 3, 4) of all rows."""
     if {*QUATERNION_COLUMNS} <= {*table.columns}:
-        poses = poses_of_rows(table, orientations_only=True).cam_from_world
+        poses = poses_of_rows(table, orientations_only=True)
         of_body = table.header[0] == "t" and (poses[:, 2, 2] > BODY_UPRIGHT).all()
         return CAM_FROM_BODY @ poses if of_body else poses
     angles = np.zeros((len(table.rows), 3))

@@ -7,17 +7,35 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from wheretolook.geometry.camera import Camera, PinholeCamera, cameras_by_id
 from wheretolook.geometry.poses import transform
 from wheretolook.geometry.tsdf import DepthImage
-from wheretolook.io.depth import read_depth
 from wheretolook.mapping.colmap_model import read_model
 from wheretolook.utils.errors import SceneError, check_positive
+from wheretolook.utils.files import MAX_DEPTH_PIXELS, load_npy, read_image
 
 MAX_MEASURED = 50  # images that the scale is measured in
+
+
+def read_depth(path: Path, scale: float = 1000.0) -> NDArray[np.float32]:
+    """Read a depth image (H, W) in metres, 0 without a reading: PNG or TIFF (integers of `scale` a metre, or floats in
+    metres) or NPY (metres).
+
+    Raises OSError or ValueError if the file is missing or damaged, SceneError if its values are no depths.
+    """
+    is_array = path.suffix.lower() == ".npy"
+    image = load_npy(path) if is_array else read_image(path, cv2.IMREAD_UNCHANGED, MAX_DEPTH_PIXELS)
+    if image.ndim != 2 or image.dtype.kind not in "fui" or image.dtype.itemsize == 1:
+        value = f"{image.dtype}, shape {image.shape}"
+        raise SceneError("this is no depth image", path=path, value=value, fix="Write one channel of 16 bits as PNG.")
+    depth_m = image.astype(np.float32) / np.float32(1.0 if image.dtype.kind == "f" else scale)
+    if image.dtype == np.uint16:  # several cameras mark pixels without a reading so, all of them by 0
+        depth_m[image == np.iinfo(np.uint16).max] = 0
+    return depth_m
 
 
 def read_depth_images(model: Path, folder: Path, scale: float = 1000.0) -> list[DepthImage]:

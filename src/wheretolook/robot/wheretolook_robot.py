@@ -30,7 +30,7 @@ camera, whose centre is -R^T t. Pixel (0.5, 0.5) is the centre of the top-left p
 quaternions are xyzw as in ROS. The camera is a pinhole; for a lens with distortion, that of its rectified images.
 
 Occlusion is not computed here. With `places`, a view sees the landmarks that are unoccluded from the nearest of them
-(`Views.place_distance` is the distance to it). Without, landmarks are visible through walls and scores behind walls are too
+(`ScoredViews.place_distance` is the distance to it). Without, landmarks are visible through walls and scores behind walls are too
 high. A robot with a better estimate passes `unoccluded`, (N,) bool.
 
 The computation, in the order of this file: select the landmarks in the image, compute their attributes for the view,
@@ -64,7 +64,7 @@ Array = NDArray[Any]
 
 
 @dataclass(frozen=True)
-class Views:
+class ScoredViews:
     """Scores of B views."""
 
     score: Array  # (B,) float64, the probability that the view localizes
@@ -76,7 +76,7 @@ class Views:
 
 @dataclass(frozen=True)
 class BestView:
-    """The best view at a location; fields as in `Views`."""
+    """The best view at a location; fields as in `ScoredViews`."""
 
     direction: Array  # (3,) unit optical axis in the map
     cam_from_world: Array  # (3, 4) pose without roll
@@ -186,7 +186,7 @@ class RobotScorer:
         """Return the probabilities (B,) that poses (B, 3, 4) localize; see `views`."""
         return self.views(cam_from_world, unoccluded).score
 
-    def views(self, cam_from_world: ArrayLike, unoccluded: ArrayLike | None = None) -> Views:
+    def views(self, cam_from_world: ArrayLike, unoccluded: ArrayLike | None = None) -> ScoredViews:
         """Score poses (B, 3, 4), or one (3, 4).
 
         `unoccluded` (N,) bool marks the landmarks that are unoccluded from these poses; by default those of the nearest
@@ -203,7 +203,9 @@ class RobotScorer:
         firsts = [0, *(np.flatnonzero(moved) + 1).tolist(), len(poses)] if len(poses) else []
         parts = [self._views_at(centers[a], rotations[a:b], unoccluded) for a, b in pairwise(firsts)]
         parts = parts or [self._views_at(np.zeros(3), rotations, unoccluded)]
-        return Views(*(np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(Views)))
+        return ScoredViews(
+            *(np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(ScoredViews))
+        )
 
     def score_directions(self, locations: ArrayLike, directions: ArrayLike) -> Array:
         """Score views without roll at locations (L, 3) m in the world along each of directions (D, 3). Returns (L, D)."""
@@ -242,14 +244,14 @@ class RobotScorer:
         rotation = rotations[first] @ self._rotation
         pose = np.concatenate([rotation, -rotation @ at[:, None]], axis=1)
         quaternion = quaternion_xyzw(rotation.T)
-        report = (getattr(views, field.name)[first].item() for field in fields(Views))
+        report = (getattr(views, field.name)[first].item() for field in fields(ScoredViews))
         return BestView(pose[2, :3], pose, quaternion, *report)
 
     def _to_world(self, points: Array) -> Array:
         """Transform points (..., 3) of the map to the world."""
         return self._scale * points @ self._rotation.T + self._translation
 
-    def _views_at(self, center: Array, rotations: Array, unoccluded: ArrayLike | None) -> Views:
+    def _views_at(self, center: Array, rotations: Array, unoccluded: ArrayLike | None) -> ScoredViews:
         """Score views at one location (3,) m with cam_from_world rotations (D, 3, 3)."""
         candidates, to_place = self._candidates(center, unoccluded)
         with np.errstate(over="ignore"):
@@ -285,7 +287,7 @@ class RobotScorer:
             score[block], inliers[block] = self._session.run(OUTPUTS, inputs)
         in_range = self._serves_camera & self._within("distance_m", distance_m)
         in_range &= (n_visible == 0) | self._within("in_view", n_visible)
-        return Views(score, n_visible, inliers, in_range, np.full(len(rotations), to_place / self._scale))
+        return ScoredViews(score, n_visible, inliers, in_range, np.full(len(rotations), to_place / self._scale))
 
     def _candidates(self, center: Array, unoccluded: ArrayLike | None) -> tuple[Array, float]:
         """Return rows of the landmarks unoccluded from a location (3,) m, and the distance to the place used."""

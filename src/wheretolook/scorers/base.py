@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from wheretolook.geometry.camera import Camera, ColmapCamera, describe_camera
 from wheretolook.geometry.poses import Float, check_poses, poses_looking_along
+from wheretolook.geometry.views import Views
 from wheretolook.inputs.channels import ALL_CHANNELS, CHANNELS
 from wheretolook.utils.errors import CameraError, ConfigError
 
@@ -22,17 +23,6 @@ if TYPE_CHECKING:
 
 BLOCK = 4096  # views scored at a time: about 80 MB of bins
 FIELD_OF_VIEW_TOLERANCE = 1e-3  # relative difference in size / focal length and of the principal point
-
-
-@dataclass(frozen=True, eq=False)
-class ViewReport:
-    """Scores of B views and what else the scorer knows of them."""
-
-    score: Float  # (B,)
-    expected_inliers: Float  # (B,) landmarks expected to be detected; NaN where it is unknown
-    n_visible: NDArray[np.int64]  # (B,) visible landmarks
-    in_range: NDArray[np.bool_]  # (B,) whether the view is in the range of the training views
-    expected_errors: Float | None = None  # (B, 2) of the pose at the right place, in metres and degrees
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,12 +76,18 @@ class Scorer(ABC):
         axes = np.tile(directions, (len(locations), 1))
         return self.score(poses_looking_along(at, axes)).reshape(len(locations), len(directions))
 
-    def report(self, cam_from_world: Float) -> ViewReport:
+    def report(self, cam_from_world: Float) -> Views:
         """Score poses (B, 3, 4) and report what else is known of their views."""
         starts, _ = self.localization_map.in_view_on_device(cam_from_world)
-        n_visible = np.diff(starts)
-        expected = self.expected_inliers(cam_from_world)
-        return ViewReport(self.score(cam_from_world), expected, n_visible, self.in_range(cam_from_world))
+        return Views(
+            cam_from_world,
+            self.localization_map.camera,
+            self.name,
+            score=self.score(cam_from_world),
+            expected_inliers=self.expected_inliers(cam_from_world),
+            n_visible=np.diff(starts),
+            in_range=self.in_range(cam_from_world),
+        )
 
     def expected_inliers(self, cam_from_world: Float) -> Float:
         """Return how many landmarks poses (B, 3, 4) are expected to detect, (B,); NaN if that is unknown."""

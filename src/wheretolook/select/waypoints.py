@@ -13,14 +13,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from wheretolook.geometry.camera_turns import pan_tilt_angles
 from wheretolook.geometry.lattices import VoxelGrid
-from wheretolook.geometry.poses import Float, camera_centers, quaternion_from_rotation, rotation_from_quaternion
-from wheretolook.io.poses import (
+from wheretolook.geometry.pose_files import (
     QUATERNION_COLUMNS,
     TRANSLATION_COLUMNS,
     holds_cam_from_world,
     poses_of_rows,
     read_named_rows,
 )
+from wheretolook.geometry.poses import Float, camera_centers, quaternion_from_rotation, rotation_from_quaternion
 from wheretolook.looks.selection import MAX_VIEWS
 from wheretolook.utils.errors import ConfigError, SceneError, TableError, check_limits, check_pitch, check_range, reject
 
@@ -112,7 +112,7 @@ class Waypoints:
 
 
 def read_waypoints(path: str | Path) -> Waypoints:
-    """Read a file in one of `io.poses.FORMATS`, detected from its columns.
+    """Read a file in one of `geometry.pose_files.FORMATS`, detected from its columns.
 
     Raises a TableError, with the line, if the file is missing, empty, has other columns, or a value is not a number.
     """
@@ -122,7 +122,7 @@ def read_waypoints(path: str | Path) -> Waypoints:
     kinds = (("heading_deg",), ("yaw_deg",), QUATERNION_COLUMNS)
     known = next((table.numbers(kind) for kind in kinds if {*kind} <= {*columns}), None)
     if "x" not in columns and holds_cam_from_world(table):
-        poses = poses_of_rows(table).cam_from_world
+        poses = poses_of_rows(table)
         points = camera_centers(poses)
         if known is not None and known.shape[1] == 4:
             known = quaternion_from_rotation(np.swapaxes(poses[:, :, :3], 1, 2))

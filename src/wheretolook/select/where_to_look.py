@@ -19,6 +19,7 @@ from wheretolook.geometry.camera import Camera, PinholeCamera, parse_camera
 from wheretolook.geometry.camera_turns import pan_tilt_angles
 from wheretolook.geometry.lattices import Lattice, direction_lattice
 from wheretolook.geometry.poses import Float, camera_centers, poses_looking_along, rigid_poses
+from wheretolook.geometry.views import Views
 from wheretolook.inputs.landmark_features import ReasonCounter
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.looks.next_look import NextLook, NextLookSelector, mean_scores_by_pitch
@@ -30,7 +31,6 @@ from wheretolook.planning.routes import PlannedPath
 from wheretolook.planning.stops import stops_along
 from wheretolook.planning.view_sequence import TurnLimit, best_sequence
 from wheretolook.scorers.base import Scorer
-from wheretolook.select.views import SelectedViews, joined
 from wheretolook.select.waypoints import SelectionRequest, Waypoints, grid_waypoints, usable_waypoints
 from wheretolook.space.mapped_space import MappedSpace
 from wheretolook.utils.devices import usable_device
@@ -300,7 +300,7 @@ class WhereToLook:
         """
         return self.scorer.score(self.frame.world_from_map.apply_to_poses(rigid_poses(cam_from_world)))
 
-    def report(self, cam_from_world: ArrayLike, names: Sequence[str] = (), skip: bool = False) -> SelectedViews:
+    def report(self, cam_from_world: ArrayLike, names: Sequence[str] = (), skip: bool = False) -> Views:
         """Score poses, as `score` takes them, and report each as a view; names count from 0 unless given.
 
         Raises a PoseError as `score`, and a TableError if one is outside the map or inside geometry, unless `skip`
@@ -322,7 +322,7 @@ class WhereToLook:
         progress: bool = False,
         accuracy: Accuracy | None = None,
         **options: Any,
-    ) -> SelectedViews:
+    ) -> Views:
         """Select the best view, the n best, or the best set of views, at each of points (W, 3) of the map.
 
         Args:
@@ -368,9 +368,7 @@ class WhereToLook:
             views = replace(views, expected_score=expected, best_expected_score=best)
         return replace(self._explained(views), waypoint=rows[views.waypoint])
 
-    def _single_views(
-        self, waypoints: Waypoints, axes: Float, scores: Float, request: SelectionRequest
-    ) -> SelectedViews:
+    def _single_views(self, waypoints: Waypoints, axes: Float, scores: Float, request: SelectionRequest) -> Views:
         """Select the n best views at each waypoint by scores (W, D) of axes (D, 3), or the best sequence."""
         if request.max_turn_deg is not None:
             chosen = best_sequence(scores, _turn_limit(axes, request.max_turn_deg)).direction_ids[:, None]
@@ -383,14 +381,14 @@ class WhereToLook:
         blocks = np.split(np.arange(len(waypoints)), range(step, len(waypoints), step))
         poses = poses_looking_along(waypoints.points[:, None], axes[chosen])
         reported = [self._reported(waypoints, np.repeat(block, k), poses[block].reshape(-1, 3, 4)) for block in blocks]
-        views = joined(reported)
+        views = Views.concatenate(reported)
         order = np.argsort(-views.score.reshape(-1, k), axis=1, kind="stable")[:, : request.n]
         best = views[(np.arange(len(waypoints))[:, None] * k + order).ravel()]
         return replace(best, rank=np.tile(np.arange(1, order.shape[1] + 1), len(waypoints)))
 
     def _view_sets(
         self, waypoints: Waypoints, axes: Float, scores: Float, n: int, max_turn_deg: float | None, progress: bool
-    ) -> SelectedViews:
+    ) -> Views:
         """Select the n views at each waypoint with the best joint score, by scores (W, D) of axes (D, 3)."""
         pairs = zip(waypoints.points, tqdm(scores, desc="looks", unit="waypoint", disable=not progress), strict=True)
         sets = []
@@ -407,7 +405,7 @@ class WhereToLook:
 
     def _sequence_with_stops(
         self, waypoints: Waypoints, axes: Float, scores: Float, request: SelectionRequest, progress: bool
-    ) -> SelectedViews:
+    ) -> Views:
         """Select the best sequence by scores (W, D) of axes (D, 3), with further looks where it scores too little."""
         assert request.looks is not None and request.max_turn_deg is not None and request.least_score is not None
         points = waypoints.points
@@ -428,28 +426,19 @@ class WhereToLook:
         poses: Float,
         rank: NDArray[np.int64] | None = None,
         set_score: Float | None = None,
-    ) -> SelectedViews:
+    ) -> Views:
         """Return the views with poses (V, 3, 4) at the waypoints of rows (V,), with their scores."""
-        report = self.scorer.report(poses)
-        errors = None if report.expected_errors is None else report.expected_errors.T
-        return SelectedViews(
+        return replace(
+            self.scorer.report(poses),
+            cam_from_world=self.frame.world_from_map.inverse.apply_to_poses(poses),
+            frame=self.frame,
             waypoint=rows,
             waypoint_id=tuple(waypoints.ids[row] for row in rows),
             rank=np.ones_like(rows) if rank is None else rank,
-            cam_from_world=self.frame.world_from_map.inverse.apply_to_poses(poses),
-            score=report.score,
-            expected_inliers=report.expected_inliers,
-            n_visible=report.n_visible,
-            in_range=report.in_range,
-            camera=self.localization_map.camera,
-            method=self.scorer.name,
             set_score=set_score,
-            frame=self.frame,
-            expected_error_m=None if errors is None else errors[0],
-            expected_error_deg=None if errors is None else errors[1],
         )
 
-    def floor_plan(self, views: SelectedViews) -> Figure:
+    def floor_plan(self, views: Views) -> Figure:
         """Draw views on a plan of the landmarks, in the map's unit, upright: a Matplotlib figure."""
         from wheretolook.figures.floor_plan import floor_plan_figure
 
@@ -463,13 +452,12 @@ class WhereToLook:
         """Counts the landmarks in views that are hard to match."""
         return ReasonCounter(self.localization_map)
 
-    def _explained(self, views: SelectedViews) -> SelectedViews:
+    def _explained(self, views: Views) -> Views:
         """Return views with the numbers of landmarks that are hard to match."""
         step = max(1, SIGHT_LINES // max(1, len(self.localization_map.landmarks)))
         poses = self.frame.world_from_map.apply_to_poses(views.cam_from_world)
-        parts = [vars(self.reasons.count(poses[row : row + step])) for row in range(0, len(poses), step)]
-        counts: dict[str, Any] = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-        return replace(views, **counts)
+        counts = Views.concatenate(self.reasons.count(poses[row : row + step]) for row in range(0, len(poses), step))
+        return replace(views, **{**counts.columns, "cam_from_world": views.cam_from_world})
 
     def _candidate_scores(self, locations: Float, axes: Float, progress: bool) -> Float:
         """Score all directions (D, 3) at locations (L, 3), (L, D)."""

@@ -29,7 +29,7 @@ from wheretolook.view.viewed_map import FIRST_CELLS, Floor, ScoredLocation, View
 if TYPE_CHECKING:
     from viser import ClientHandle
 
-    from wheretolook.inputs.landmark_features import ReasonCounts
+    from wheretolook.geometry.views import Views
 
 MARKERS = ("/sphere", "/view", "/views", "/turn", "/seen")  # hidden while the browser's camera is inside
 SETTLE_S = 0.3  # camera motion this soon after the program moved the camera is not by hand
@@ -190,7 +190,7 @@ class LocationView:
             self.turn_to(rotation_from_quaternion(self.session.client.camera.wxyz)[:, 2])
 
 
-def describe_reasons(counts: ReasonCounts) -> str:
+def describe_reasons(counts: Views) -> str:
     """State how many landmarks are hard to match in a view, by reason."""
     names = {"too far": counts.n_too_far, "too oblique": counts.n_too_oblique, "repeated": counts.n_repeated}
     of_visible = ", ".join(f"{n[0]:,.0f} {name}" for name, n in names.items() if np.isfinite(n[0]))

@@ -131,7 +131,7 @@ def read_paths(path: Path, pair: int = 0, world_from_map: Similarity = IDENTITY.
     Poses are moved from the map's own frame to the world. A single path is accompanied by `FORWARD`: the same locations
     seen by a camera that looks ahead. Raises TableError if the file is missing or has no valid poses.
     """
-    from wheretolook.io.poses import read_poses
+    from wheretolook.geometry.views import Views
     from wheretolook.planning.config import FORWARD
 
     if path.is_dir():
@@ -139,7 +139,7 @@ def read_paths(path: Path, pair: int = 0, world_from_map: Similarity = IDENTITY.
     if path.suffix == ".parquet":
         paths = _compared_paths(path, pair)
     else:
-        paths = {"planned" if path.name == "path.csv" else path.stem: RecordedPath(read_poses(path).cam_from_world)}
+        paths = {"planned" if path.name == "path.csv" else path.stem: RecordedPath(Views.read(path).cam_from_world)}
     if not 1 <= len(paths) <= MAX_METHODS:
         problem = f"1 to {MAX_METHODS} methods can be shown"
         raise TableError(problem, path=path, value=len(paths), fix="Correct --pair, or leave out methods.")

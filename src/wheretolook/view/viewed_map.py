@@ -32,10 +32,10 @@ if TYPE_CHECKING:  # torch and Warp are imported when first needed: the page ope
     import pandas as pd
 
     from wheretolook.dataset.layout import SceneFolder
+    from wheretolook.geometry.views import Views
     from wheretolook.inputs.localization_map import LocalizationMap
     from wheretolook.mapping.landmarks import Landmarks
     from wheretolook.scorers.base import Scorer
-    from wheretolook.select.views import SelectedViews
     from wheretolook.select.where_to_look import WhereToLook
 
 FLOOR_CELLS = 1200  # approximate number of cells in a floor's rectangle
@@ -147,7 +147,7 @@ class ScoredLocation:
     position: Float  # (3,) m
     directions: Float  # (D, 3) unit optical axes
     scores: Float  # (D,)
-    best: SelectedViews  # best first
+    best: Views  # best first
 
 
 def score_location(selector: WhereToLook, position: Float, n: int) -> ScoredLocation:

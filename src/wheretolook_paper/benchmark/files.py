@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
+from wheretolook.geometry.pose_files import pose_texts, poses_of_values, read_rows
 from wheretolook.geometry.poses import Float
-from wheretolook.io.poses import pose_texts, poses_of_values, read_rows
 from wheretolook.utils.errors import TableError
 from wheretolook.utils.files import write_text
 

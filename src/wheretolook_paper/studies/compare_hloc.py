@@ -52,8 +52,8 @@ from wheretolook.features.config import ExtractorConfig, KeypointExtractor
 from wheretolook.features.extractor import Keypoints
 from wheretolook.features.registry import all_kinds, kind_of
 from wheretolook.geometry.camera import Camera, camera_of, write_cameras
+from wheretolook.geometry.pose_files import images_text
 from wheretolook.geometry.poses import Float, camera_centers, pose_error
-from wheretolook.io.poses import images_text
 from wheretolook.localization.confidence import probabilities
 from wheretolook.localization.config import LabelConfig, LocalizerConfig
 from wheretolook.localization.localizer import Localizer

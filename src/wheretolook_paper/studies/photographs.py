@@ -32,9 +32,9 @@ from wheretolook.geometry.poses import Float, camera_centers, invert_poses, pose
 from wheretolook.holdout.photo_map import open_map
 from wheretolook.holdout.report import check_map
 from wheretolook.holdout.scores import Scoring
-from wheretolook.io.depth import read_depth
 from wheretolook.mapping.colmap_model import colmap_poses, holds_model
 from wheretolook.mapping.config import MIN_TRIANGULATION_ANGLE_DEG, FrameOptions, MapConfig, PhotographsConfig
+from wheretolook.mapping.depth_images import read_depth
 from wheretolook.mapping.georeference import fit_similarity
 from wheretolook.mapping.map_folder import MapRun
 from wheretolook.mapping.photograph_map import map_photographs, photograph_features

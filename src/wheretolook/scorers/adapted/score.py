@@ -9,11 +9,12 @@ from numpy.typing import NDArray
 from scipy.special import expit
 
 from wheretolook.geometry.poses import Float, check_locations
+from wheretolook.geometry.views import Views
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.scorers.adapted.calibration import finite_log_odds
 from wheretolook.scorers.adapted.network import AdaptedNetwork
 from wheretolook.scorers.adapted.place import MIN_SHARE, share_of_place
-from wheretolook.scorers.base import Scorer, ViewReport
+from wheretolook.scorers.base import Scorer
 from wheretolook.scorers.registry import BuildOptions
 from wheretolook.scorers.set.score import SetScorer
 from wheretolook.training.trained_network import TrainedNetwork
@@ -59,10 +60,10 @@ class AdaptedScorer(Scorer):
         """Return probabilities (L, D); see `SetScorer.score_directions`."""
         return self._adapted(self.base.score_directions(check_locations(locations), directions))
 
-    def report(self, cam_from_world: Float) -> ViewReport:
+    def report(self, cam_from_world: Float) -> Views:
         """Return the base network's report with the adapted score."""
         report = self.base.report(cam_from_world)
-        return replace(report, score=self._adapted(report.score))
+        return replace(report, method=self.name, score=self._adapted(report.score))
 
     def in_range(self, cam_from_world: Float) -> NDArray[np.bool_]:
         """Return which poses (B, 3, 4) have views in the range of the training views, (B,)."""

@@ -15,10 +15,11 @@ from torch import Tensor
 from wheretolook.dataset.config import Accuracy, checked_accuracy, threshold_key
 from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.poses import Float, check_poses
+from wheretolook.geometry.views import Views
 from wheretolook.inputs.landmark_features import LandmarkDescriber, ViewLandmarks
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.colmap_model import observation_matrix, select_points
-from wheretolook.scorers.base import LandmarkProbabilities, Scorer, ViewReport
+from wheretolook.scorers.base import LandmarkProbabilities, Scorer
 from wheretolook.scorers.matchability.network import bearing_precision
 from wheretolook.scorers.set.accuracy import AccuracyModel, probabilities, statistics_of
 from wheretolook.scorers.set.batched_directions import BatchedDirections
@@ -235,21 +236,33 @@ class SetScorer(LandmarkScorer):
         self._watch.check(self.name, self.training_range, quantities)
         return scores
 
-    def report(self, cam_from_world: Float) -> ViewReport:
+    def report(self, cam_from_world: Float) -> Views:
         """See `Scorer.report`; does not warn of views out of range, which the report names."""
         cam_from_world = check_poses(cam_from_world)
         n = len(cam_from_world)
+        score = np.empty(n)
+        expected_inliers = np.zeros(n)
+        errors = np.empty((n, 2))
+        n_visible = np.zeros(n, dtype=np.int64)
         in_range = np.full(n, self._serves_camera)
-        report = ViewReport(np.empty(n), np.zeros(n), np.zeros(n, dtype=np.int64), in_range, np.empty((n, 2)))
-        assert report.expected_errors is not None
-        for rows, described, n_visible in self.describer.in_blocks(cam_from_world, MAX_LANDMARKS):
-            sums = self._sums(cam_from_world[rows], described, n_visible)
-            report.score[rows] = probabilities(self.trained, self.accuracy, *sums)
-            report.expected_inliers[rows] = sums[0][:, 0].cpu().numpy()
-            report.expected_errors[rows] = AccuracyModel.bundled().expected_errors(statistics_of(self.network, *sums))
-            report.n_visible[rows] = n_visible.cpu().numpy()
-            report.in_range[rows] &= self._in_range(described, n_visible)
-        return report
+        for rows, described, visible in self.describer.in_blocks(cam_from_world, MAX_LANDMARKS):
+            sums = self._sums(cam_from_world[rows], described, visible)
+            score[rows] = probabilities(self.trained, self.accuracy, *sums)
+            expected_inliers[rows] = sums[0][:, 0].cpu().numpy()
+            errors[rows] = AccuracyModel.bundled().expected_errors(statistics_of(self.network, *sums))
+            n_visible[rows] = visible.cpu().numpy()
+            in_range[rows] &= self._in_range(described, visible)
+        return Views(
+            cam_from_world,
+            self.localization_map.camera,
+            self.name,
+            score=score,
+            expected_inliers=expected_inliers,
+            n_visible=n_visible,
+            in_range=in_range,
+            expected_error_m=errors[:, 0],
+            expected_error_deg=errors[:, 1],
+        )
 
     def _in_range(self, described: ViewLandmarks, n_visible: Tensor) -> NDArray[np.bool_]:
         deviations = self.network.matchability.input(described.values) * self._signs

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from functools import cached_property
 from itertools import islice
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -139,24 +138,11 @@ def read_named_rows(path: str | Path) -> NamedRows:
     return NamedRows(path, names, rows)
 
 
-class NamedPoses(NamedTuple):
-    """N poses and their names."""
+def poses_of_rows(table: NamedRows, orientations_only: bool = False) -> Float:
+    """Return the poses cam_from_world (N, 3, 4) in rows, of the columns that `wheretolook.geometry.views.Views.read` names.
 
-    names: tuple[str, ...]
-    cam_from_world: Float  # (N, 3, 4)
-
-
-def read_poses(path: str | Path) -> NamedPoses:
-    """Read poses and their names from a TUM trajectory, COLMAP's images.txt, or a CSV with a line of column names.
-
-    A CSV holds x, y, z and qw, qx, qy, qz, or in this order tx, ty, tz, qx, qy, qz, qw (world_from_cam); or in this order
-    qw, qx, qy, qz, tx, ty, tz (cam_from_world). Raises TableError, with the line, if the file is missing or holds no poses.
+    With `orientations_only` positions may be missing, and are then 0. Raises TableError, with the line, for others.
     """
-    return poses_of_rows(read_named_rows(path))
-
-
-def poses_of_rows(table: NamedRows, orientations_only: bool = False) -> NamedPoses:
-    """Return the poses in rows (see `read_poses`); with `orientations_only` positions may be missing, and are then 0."""
     path = table.path
     quaternions = table.numbers(QUATERNION_COLUMNS)
     lengths = np.linalg.norm(quaternions, axis=1)
@@ -167,7 +153,7 @@ def poses_of_rows(table: NamedRows, orientations_only: bool = False) -> NamedPos
     if not orientations_only or {"x", "tx"} & {*table.columns}:
         locations = table.numbers(TRANSLATION_COLUMNS if {*TRANSLATION_COLUMNS} <= {*table.columns} else "xyz")
     poses = poses_of_values(np.concatenate([quaternions, locations], axis=1))
-    return NamedPoses(table.names, poses if holds_cam_from_world(table) else invert_poses(poses))
+    return poses if holds_cam_from_world(table) else invert_poses(poses)
 
 
 def holds_cam_from_world(table: NamedRows) -> bool:

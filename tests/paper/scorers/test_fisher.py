@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-from twins.fisher import eigenvalues_plain
 
+from paper.fisher.twins import eigenvalues_plain
 from synthetic_dataset import make_landmarks
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.lattices import fibonacci_sphere

@@ -38,9 +38,8 @@ from wheretolook.space.free_space import FreeSpace
 from wheretolook.tracking.store import TrackingConfig
 from wheretolook.utils.processes import cores
 from wheretolook.utils.warp import start_warp
-from wheretolook.visibility.counting import FrustumCounter
+from wheretolook.visibility.counting import FrustumCounter, SurveyOptions, survey
 from wheretolook.visibility.occlusion import DevicePoints, MeshOcclusion, NoOcclusion
-from wheretolook.visibility.survey import SurveyOptions, survey
 from wheretolook_paper.figures.runtimes import runtime_figure, scaling_figure
 from wheretolook_paper.release.benchmark_runs import RUNTIMES_CSV, SCALING_CSV, log_runtimes
 from wheretolook_rooms.generator import generate_apartment

@@ -10,7 +10,7 @@ import torch
 
 from selection.room import WEIGHTS, write_room
 from synthetic_dataset import make_dataset
-from wheretolook.scorers.adapted.network import AdaptedNetwork
+from wheretolook.scorers.adapted.score import AdaptedNetwork
 from wheretolook.scorers.set.network import SetNetwork
 from wheretolook.training.provenance import training_fingerprint
 from wheretolook.training.trained_network import TrainedNetwork

@@ -16,13 +16,13 @@ import numpy as np
 import torch
 from bench_visibility import machine
 from common import ROOM_M, options, room_map, seconds_of, show, timed
-from wheretolook.utils.shipped import WEIGHTS, shipped
 
 from wheretolook.geometry.lattices import fibonacci_sphere
 from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.scorers.registry import make_scorer
 from wheretolook.scorers.weights import load_scorer
 from wheretolook.utils.errors import WhereToLookError
+from wheretolook.utils.package import WEIGHTS, shipped
 
 
 def main():

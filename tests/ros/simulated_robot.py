@@ -17,6 +17,7 @@ from trajectory_msgs.msg import JointTrajectory
 from wheretolook_ros.conversions import pose_matrix, pose_message
 from wheretolook_ros.node import RobotNode, run
 
+from ros.processes import info_of
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import compose_poses, invert_poses
 from wheretolook.rendering.warp_renderer import WarpRenderer
@@ -143,12 +144,7 @@ class SimulatedRobot(RobotNode):
         assert self._base is not None
         map_from_camera = compose_poses(self._base, self.head.base_from_camera(*self._joints))
         rgb = self._renderer.render(self.camera, invert_poses(map_from_camera)[None]).rgb[0]
-        info = CameraInfo(width=self.camera.width, height=self.camera.height, distortion_model="plumb_bob")
-        matrix = self.camera.matrix
-        matrix[:2, 2] -= 0.5
-        info.k = matrix.ravel().tolist()
-        info.p = np.column_stack([matrix, np.zeros(3)]).ravel().tolist()
-        info.d = [0.0] * 5
+        info = info_of(self.camera)
         image = Image(height=rgb.shape[0], width=rgb.shape[1], encoding="rgb8", step=3 * rgb.shape[1])
         image.data = np.ascontiguousarray(rgb, dtype=np.uint8).tobytes()
         truth = PoseStamped(pose=pose_message(map_from_camera))

@@ -26,6 +26,7 @@ from wheretolook.mapping.colmap_model import load_mapping_poses, save_mapping_po
 from wheretolook.mapping.config import MapConfig
 from wheretolook.mapping.georeference import REPORT_FILE
 from wheretolook.mapping.landmarks import Landmarks
+from wheretolook.mapping.map import Map
 from wheretolook.mapping.rendered_map import build_map
 from wheretolook.planning.scene_map import build_viewpoint_map
 from wheretolook.planning.viewpoint_map import ViewpointMap
@@ -146,7 +147,7 @@ def test_scores_are_the_same_by_every_method(model):
         (far_room(), far_landmarks(landmarks), far_poses),
     ):
         hides = MeshOcclusion(MeshRaycaster(mesh)) if model == "mesh" else HiddenPointRemoval()
-        views.append((LocalizationMap(there, CAMERA, hides, mapping_poses=move(known)), move(poses)))
+        views.append((LocalizationMap(Map(there, mapping_poses=move(known)), CAMERA, hides), move(poses)))
     released = {"set": "set", "expected-inliers": "matchability", "mlp-2d+z": "mlp-2d+z"}
     rules = [name for name, method in scorers().items() if method.learn is None and not method.weights]
     for name in (*rules, *released) if model == "mesh" else ("visible",):
@@ -222,7 +223,7 @@ def test_a_viewpoint_map_and_a_robots_file_are_the_same(tmp_path):
     robots = []
     for shift, mesh in ((0 * SHIFT, furnished_room()), (SHIFT, far_room())):
         there = replace(landmarks, points=landmarks.points + shift)
-        localization_map = LocalizationMap(there, CAMERA, MeshOcclusion(MeshRaycaster(mesh)))
+        localization_map = LocalizationMap(Map(there), CAMERA, MeshOcclusion(MeshRaycaster(mesh)))
         scorer = make_scorer("set", localization_map, weights=weights)
         grid = VoxelGrid(tuple(shift), tuple(shift + ROOM), GRID.shape)
         folder = tmp_path / str(len(maps))

@@ -9,7 +9,7 @@ import pytest
 
 import wheretolook
 from synthetic_dataset import CAMERA, make_landmarks
-from wheretolook import LocalizationMap, load_scorer, poses_looking_along
+from wheretolook import LocalizationMap, Map, load_scorer, poses_looking_along
 from wheretolook.cli import parse_command
 from wheretolook.geometry.lattices import fibonacci_sphere
 from wheretolook.utils.errors import ConfigError
@@ -53,7 +53,7 @@ def test_files_of_ones_own_come_first(elsewhere):
 
 @pytest.mark.usefixtures("elsewhere")
 def test_a_map_is_scored_by_the_weights_that_ship():
-    localization_map = LocalizationMap(make_landmarks(np.random.default_rng(0), 200), CAMERA)
+    localization_map = LocalizationMap(Map(make_landmarks(np.random.default_rng(0), 200)), CAMERA)
     views = poses_looking_along([(0.5, 0, 1)] * 12, fibonacci_sphere(12))
     expected = load_scorer(ROOT / WEIGHTS / "set.safetensors", localization_map).score(views)
     for weights in (None, WEIGHTS):

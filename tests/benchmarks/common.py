@@ -17,6 +17,7 @@ from wheretolook.geometry.mesh import TexturedMesh
 from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.landmarks import Landmarks
+from wheretolook.mapping.map import Map
 from wheretolook.scenes.config import ApartmentConfig
 from wheretolook.scenes.loading import load_mesh, save_glb
 from wheretolook.space.free_space import FreeSpace
@@ -111,7 +112,7 @@ def room_map(n_landmarks, locations, device):
         ambiguity=uniform(0.5, 1),
     )
     occlusion = StoredOcclusion.from_mask(locations, rng.random((len(locations), n_landmarks)) < 0.5)
-    return LocalizationMap(landmarks, PinholeCamera(), occlusion, device)
+    return LocalizationMap(Map(landmarks), PinholeCamera(), occlusion, device)
 
 
 def points_on_surface(mesh, n, rng):

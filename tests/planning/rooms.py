@@ -12,6 +12,7 @@ from wheretolook.dataset.layout import Dataset, SceneFolder
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.lattices import VoxelGrid, direction_lattice
 from wheretolook.inputs.localization_map import LocalizationMap
+from wheretolook.mapping.map import Map
 from wheretolook.planning.scene_map import build_viewpoint_map
 from wheretolook.rendering.raycasting import MeshRaycaster
 from wheretolook.scenes.loading import save_glb
@@ -64,7 +65,7 @@ def free_voxels():
 
 def room_map(landmarks, model=None):
     """Return the localization map of the room."""
-    return LocalizationMap(landmarks, CAMERA, model or occlusion())
+    return LocalizationMap(Map(landmarks), CAMERA, model or occlusion())
 
 
 def build(landmarks, method="bins", directions=DIRECTIONS):

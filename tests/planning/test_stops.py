@@ -10,6 +10,7 @@ from planning.rooms import CAMERA, occlusion, room_landmarks
 from wheretolook.geometry.lattices import direction_lattice
 from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.inputs.localization_map import LocalizationMap
+from wheretolook.mapping.map import Map
 from wheretolook.planning.config import PathConfig, StopConfig
 from wheretolook.planning.method_paths import path_views
 from wheretolook.planning.routes import PlannedPath
@@ -26,7 +27,7 @@ POSITIONS = np.linspace((0.8, 0.8, 1.4), (3.2, 0.8, 1.4), 5)
 
 @pytest.fixture(scope="module")
 def scorer():
-    return make_scorer("set", LocalizationMap(room_landmarks(300), CAMERA, occlusion()), weights=WEIGHTS)
+    return make_scorer("set", LocalizationMap(Map(room_landmarks(300)), CAMERA, occlusion()), weights=WEIGHTS)
 
 
 @pytest.fixture(scope="module")

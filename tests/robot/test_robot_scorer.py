@@ -21,6 +21,7 @@ from wheretolook.geometry.poses import invert_poses, poses_looking_along
 from wheretolook.inputs.channels import ATTRIBUTES
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.inputs.statistics import FeatureStatistics
+from wheretolook.mapping.map import Map
 from wheretolook.robot import wheretolook_robot
 from wheretolook.robot.export import export_robot, pinhole_of
 from wheretolook.robot.wheretolook_robot import RobotScorer
@@ -98,7 +99,7 @@ NETWORKS = {
 def test_scores_are_those_of_pytorch(name, camera, tmp_path):
     weights = tmp_path / "set.safetensors"
     random_network(len(name), **NETWORKS[name]).save(weights)
-    localization_map = LocalizationMap(walls(1500, len(name)), camera)
+    localization_map = LocalizationMap(Map(walls(1500, len(name))), camera)
     poses = some_poses(120, len(name))
     for accuracy in (None, (0.001, 0.01), (0.25, 2.0), (1e3, 90.0), (np.inf, np.inf)):
         scorer = load_scorer(weights, localization_map)
@@ -120,7 +121,7 @@ def test_scores_are_those_of_pytorch(name, camera, tmp_path):
 @pytest.mark.parametrize("n", [1, 60, 25_000])
 def test_bundled_weights_on_maps_of_any_size(n, tmp_path):
     """From views without landmarks to views with more than are sampled."""
-    localization_map = LocalizationMap(walls(n, n), CAMERAS["wide, upright"])
+    localization_map = LocalizationMap(Map(walls(n, n)), CAMERAS["wide, upright"])
     poses = some_poses(80, n)
     expected = load_scorer(BUNDLED, localization_map).score(poses)
     views = RobotScorer(export_robot(localization_map, BUNDLED, tmp_path)).views(poses)
@@ -136,7 +137,9 @@ def room_map():
     axis = rng.integers(0, 3, 600)
     points[np.arange(600), axis] = np.array(ROOM)[axis] * rng.integers(0, 2, 600)
     space = FreeSpace(furnished_room())
-    return LocalizationMap(replace(make_landmarks(rng, 600), points=points), CAMERA, MeshOcclusion(space.raycaster))
+    return LocalizationMap(
+        Map(replace(make_landmarks(rng, 600), points=points)), CAMERA, MeshOcclusion(space.raycaster)
+    )
 
 
 @pytest.fixture(scope="module")
@@ -219,7 +222,7 @@ def test_the_folder_runs_by_itself(folder, tmp_path):
     np.save(copy / "poses.npy", poses)
     subprocess.run([sys.executable, "-c", WITHOUT_PYTORCH], cwd=copy, check=True)
     np.testing.assert_array_equal(np.load(copy / "scores.npy"), RobotScorer(folder).score(poses))
-    other = export_robot(LocalizationMap(walls(50), CAMERA), BUNDLED, tmp_path / "other")
+    other = export_robot(LocalizationMap(Map(walls(50)), CAMERA), BUNDLED, tmp_path / "other")
     shutil.copy(other / "landmarks.npz", copy)
     with pytest.raises(ValueError):  # landmarks of another export
         RobotScorer(copy)

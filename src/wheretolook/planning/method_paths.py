@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from wheretolook.dataset.environment import Environment
 from wheretolook.dataset.layout import Dataset
+from wheretolook.dataset.scene import Scene
 from wheretolook.geometry.poses import poses_looking_along, transform
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.planning.config import FORWARD, PlanConfig
@@ -24,7 +24,7 @@ from wheretolook.scorers.weights import resolve_weights
 
 
 def plan_by_methods(
-    scene: Environment,
+    scene: Scene,
     dataset: Dataset | None,
     methods: Iterable[str],
     start: ArrayLike,

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from tqdm.auto import tqdm
 
 from wheretolook.dataset.config import ACCURACY, Accuracy
-from wheretolook.dataset.environment import ColmapEnvironment, ColmapFiles, EnvironmentConfig
+from wheretolook.dataset.scene import ColmapFiles, Scene, SceneConfig
 from wheretolook.geometry.camera import Camera, PinholeCamera, parse_camera
 from wheretolook.geometry.camera_turns import pan_tilt_angles
 from wheretolook.geometry.lattices import Lattice, direction_lattice
@@ -109,7 +109,7 @@ SPARE = 3
 """Views of a waypoint, beyond those asked for, whose scores are computed again: where many landmarks are in view, the
 scores of all directions are computed from other samples of them."""
 
-CONFIG = EnvironmentConfig(occlusion_cache_bytes=1 << 30)
+CONFIG = SceneConfig(occlusion_cache_bytes=1 << 30)
 
 PAN_TOLERANCE_DEG = 1e-9
 SIGHT_LINES = 1 << 24  # lines of sight tested at once
@@ -196,12 +196,12 @@ class WhereToLook:
         mesh, depth, database = (None if file is None else Path(file) for file in (mesh, depth, database))
         options = FrameOptions(**frame)
         files = ColmapFiles(Path(path), mesh, depth, depth_scale, database, max_reprojection_error_px, options)
-        environment = ColmapEnvironment(files, camera, occlusion or "", CONFIG, device)
-        here = environment.localization_map
+        scene = Scene.of_colmap(files, camera, occlusion, CONFIG, device)
+        here = scene.localization_map
         weights = resolve_weights(method, weights, here.landmarks.features)
         if not method:
-            return cls(load_scorer(weights, here, anywhere), axes, environment.space, files)
-        return cls(make_scorer(method, here, weights=weights, anywhere=anywhere), axes, environment.space, files)
+            return cls(load_scorer(weights, here, anywhere), axes, scene.space, files)
+        return cls(make_scorer(method, here, weights=weights, anywhere=anywhere), axes, scene.space, files)
 
     @property
     def localization_map(self) -> LocalizationMap:

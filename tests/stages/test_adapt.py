@@ -4,9 +4,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from fixed_fields import main
 from stages.test_pipeline import EXPERIMENT
 from synthetic_dataset import make_dataset
-from wheretolook.cli import main
 from wheretolook.dataset.layout import Dataset
 from wheretolook.dataset.viewpoint_files import write_table
 from wheretolook.dataset.viewpoint_table import is_good, poses
@@ -46,7 +46,7 @@ def test_adapted_weights_have_a_lower_loss_and_are_logged(dataset, capsys):
     good = is_good(table)
     losses = []
     for weights in (None, path):
-        probability = load_scorer(weights, localization_map).score(poses(table)).clip(1e-9, 1 - 1e-9)
+        probability = load_scorer(localization_map, weights).score(poses(table)).clip(1e-9, 1 - 1e-9)
         losses.append(-np.log(np.where(good, probability, 1 - probability)).mean())
     assert losses[1] < losses[0]
     training = read_training(path)
@@ -59,7 +59,7 @@ def test_adapted_weights_have_a_lower_loss_and_are_logged(dataset, capsys):
 def test_weights_without_a_gain_are_not_kept(dataset, capsys):
     scene = dataset.scenes[1]
     table = scene.read_table()
-    scored = load_scorer(None, scene.localization_map(scene.camera)).score(poses(table))
+    scored = load_scorer(scene.localization_map(scene.camera)).score(poses(table))
     draws = np.random.default_rng(5).random(len(table))
     localized = draws < scored  # the scorer is right
     table["status"] = np.where(localized, "localized", "no_pose")

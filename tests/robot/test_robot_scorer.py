@@ -91,7 +91,7 @@ NETWORKS = {
 
 @pytest.mark.parametrize(
     ("name", "camera"),
-    [*((name, CAMERAS["paper"]) for name in NETWORKS), *(("small", camera) for camera in CAMERAS.values())],
+    [*((name, CAMERAS["paper"]) for name in NETWORKS), *(("small", camera) for camera in [*CAMERAS.values()][1:])],
 )
 def test_scores_are_those_of_pytorch(name, camera, tmp_path):
     weights = tmp_path / "set.safetensors"
@@ -108,7 +108,8 @@ def test_scores_are_those_of_pytorch(name, camera, tmp_path):
     np.testing.assert_array_equal(views.in_range, scorer.in_range(poses))
     assert 0 < views.in_range.sum() < len(poses)
     np.testing.assert_allclose(robot.score(poses[7]), expected[7:8], atol=TOLERANCE, rtol=0)
-    for file, accuracy in product((weights, BUNDLED), ((0.001, 0.01), (0.25, 2.0), (1e3, 90.0), (np.inf, np.inf))):
+    accuracies = ((0.001, 0.01), (0.25, 2.0), (1e3, 90.0), (np.inf, np.inf)) if camera == CAMERAS["paper"] else ()
+    for file, accuracy in product((weights, BUNDLED), accuracies):
         scorer = load_scorer(localization_map, file).at_accuracy(accuracy)
         folder = export_robot(localization_map, file, tmp_path / "robot", accuracy=accuracy)
         np.testing.assert_allclose(RobotScorer(folder).score(poses), scorer.score(poses), atol=TOLERANCE, rtol=0)

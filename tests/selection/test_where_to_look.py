@@ -234,7 +234,6 @@ def test_a_sequence_stops_where_one_look_will_not_do(look, tmp_path):
     "options",
     [
         {"n": 0}, {"looks": 0}, {"n": 2, "looks": 2}, {"n": 2, "max_turn_deg": 30}, {"looks": 2, "max_turn_deg": 30},
-        {"max_turn_deg": 0.5},  # radians
         {"max_total_turn_deg": 30},
         {"pitch_deg": (30, -30)}, {"pitch_deg": 10}, {"pitch_deg": (-100, 0)}, {"pitch_deg": (30, np.nan)},
         {"pitch_deg": (-0.5, 0.5)},  # radians
@@ -291,3 +290,9 @@ def test_best_views_apart(look):
     assert (np.diff(apart.score.reshape(4, 4)) <= 0).all()
     with pytest.raises(ConfigError, match="waypoint 0 has too few views"):
         look.best(POINTS, 4, apart_deg=170)
+
+
+def test_a_turn_in_radians_is_rejected(look):
+    with pytest.raises(ConfigError):
+        look.best(POINTS, max_turn_deg=0.5)
+    assert len({*map(tuple, look.best(POINTS, max_turn_deg=0).axes.round(6).tolist())}) == 1

@@ -93,6 +93,17 @@ def test_encodings(robot, encoding):
     robot.localized(BASE)
 
 
+def test_a_compressed_image_that_would_fill_the_memory():
+    """Its size is read before it is decoded."""
+    png = cv2.imencode(".png", np.zeros((12_000, 12_000), np.uint8))[1].tobytes()
+    assert len(png) < 1_000_000
+    with pytest.raises(ValueError, match="12000 x 12000 px, but camera_info says 640 x 480"):
+        grey_image(CompressedImage(format="png", data=png), (640, 480))
+    hdr = b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 40000 +X 40000\n" + bytes(50)
+    with pytest.raises(ValueError, match="cannot decode"):
+        grey_image(CompressedImage(format="hdr", data=hdr), (640, 480))
+
+
 def test_16_bits_are_shifted_by_the_brightest_pixel():
     """No field of an Image states how many of its 16 bits a camera uses; a black image stays black."""
     grey = np.random.default_rng(0).integers(0, 250, (480, 640), dtype=np.uint8)
@@ -100,10 +111,10 @@ def test_16_bits_are_shifted_by_the_brightest_pixel():
     for bits in (8, 10, 12, 14, 16):
         values = grey.astype(np.uint16) << (bits - 8)
         for kind in ("<u2", ">u2"):
-            np.testing.assert_array_equal(grey_image(image_of_16_bits(values.astype(kind))), grey)
+            np.testing.assert_array_equal(grey_image(image_of_16_bits(values.astype(kind)), (640, 480)), grey)
         png = CompressedImage(format="mono16; png compressed", data=cv2.imencode(".png", values)[1].tobytes())
-        np.testing.assert_array_equal(grey_image(png), grey)
-    assert grey_image(image_of_16_bits(np.full((480, 640), 3, "<u2"))).max() == 3
+        np.testing.assert_array_equal(grey_image(png, (640, 480)), grey)
+    assert grey_image(image_of_16_bits(np.full((480, 640), 3, "<u2")), (640, 480)).max() == 3
 
 
 @pytest.mark.parametrize("size", [(320, 240), (1280, 960)])
@@ -186,6 +197,10 @@ def test_a_prior_does_no_harm_and_one_of_another_frame_is_reported(robot):
         (True, {"binning_x": 2}, "binning"),
         (True, {"roi": RegionOfInterest(width=320, height=240)}, "region of interest"),
         (True, {"k": [1e-9, 0.0, 0.0, 0.0, 1e-9, 0.0, 0.0, 0.0, 1.0]}, "focal length"),
+        (True, {"k": [320.0, 0.0, np.nan, 0.0, 320.0, 240.0, 0.0, 0.0, 1.0]}, "k has a number that is not finite"),
+        (True, {"d": [0.1, np.inf, 0.0, 0.0, 0.0]}, "d has a number that is not finite"),
+        (True, {"width": 0, "height": 0}, "camera_info says 0 x 0"),
+        (True, {"d": [0.1] * 7}, "plumb_bob' has another number of coefficients than 7"),
     ],
 )
 def test_images_and_cameras_that_cannot_be_used(robot, of_camera, change, message):

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import asdict, replace
+from itertools import cycle
 
 import numpy as np
 import pandas as pd
@@ -53,7 +54,10 @@ def room_model(cameras=(LOOKS,)):
     angle = np.linspace(0, 2 * np.pi, 36, endpoint=False)
     centers = np.array([3.0, 2.5, 1.4]) + np.column_stack([1.6 * np.cos(angle), 1.2 * np.sin(angle), 0 * angle])
     poses = poses_looking_along(centers, np.column_stack([np.cos(3 * angle), np.sin(3 * angle), 0 * angle]))
-    seen = [cameras[k % len(cameras)].sees(transform(pose, points)) for k, pose in enumerate(poses)]
+    seen = []
+    for pose, camera in zip(poses, cycle(cameras), strict=False):
+        there = transform(pose, points)
+        seen.append((there[:, 2] > 0) & camera.in_image(camera.project(there)))
     return colmap_model(points, poses, seen, cameras)
 
 

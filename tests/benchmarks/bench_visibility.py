@@ -41,7 +41,7 @@ from wheretolook.utils.warp import start_warp
 from wheretolook.visibility.counting import FrustumCounter, SurveyOptions, survey
 from wheretolook.visibility.occlusion import DevicePoints, MeshOcclusion, NoOcclusion
 from wheretolook_paper.figures.runtimes import runtime_figure, scaling_figure
-from wheretolook_paper.release.benchmark_runs import RUNTIMES_CSV, SCALING_CSV, log_runtimes
+from wheretolook_paper.release.runs import RUNTIMES_CSV, SCALING_CSV, log_runtimes
 from wheretolook_rooms.generator import generate_apartment
 
 CAMERA = PinholeCamera()

@@ -306,7 +306,7 @@ def test_planned_paths_are_rendered_and_localized(copy, capsys):
     kept = {path: path.stat().st_mtime_ns for path in (root / "paths").glob("*/*.parquet")}
     assert run(*options, paths__min_distance_m=1) == 0  # reuses the views localized with more options
     assert {path: path.stat().st_mtime_ns for path in kept} == kept
-    for invalid in (["--paths.methods", "[forward,visible]", *joint], ["--paths.scenes", "[nowhere]"]):
+    for invalid in (["--paths.methods", "[forward,visible]", *joint], ["--in-scenes", "[nowhere]"]):
         assert run(*options, *invalid, paths__min_distance_m=1) == 2
 
 

@@ -9,10 +9,10 @@ from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.lattices import fibonacci_sphere, released_lattice
 from wheretolook.geometry.poses import poses_looking_along
 from wheretolook_paper.figures.dollhouse import dollhouse
-from wheretolook_paper.figures.lattices import covering_radius_deg, nearest_angles_deg
-from wheretolook_paper.figures.look_story import Estimate, LookStory, film_frames, story_figure
-from wheretolook_paper.figures.peaks import spread_extrema
+from wheretolook_paper.figures.looks import Estimate, LookStory, film_frames, story_figure
+from wheretolook_paper.figures.network import spread_extrema
 from wheretolook_paper.figures.runtimes import step_table
+from wheretolook_paper.figures.sampling import covering_radius_deg, nearest_angles_deg
 
 
 def test_covering_radius_of_platonic_solids_and_lattices():

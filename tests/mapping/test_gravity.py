@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from wheretolook.geometry.poses import poses_looking_along
-from wheretolook.mapping.gravity import estimate_gravity, rotation_to_z
+from wheretolook.mapping.map_frame import estimate_gravity, rotation_to_z
 
 TURN = Rotation.from_euler("xyz", [40, -65, 110], degrees=True).as_matrix()
 """From the world to the arbitrary frame of a mapping."""

@@ -36,11 +36,9 @@ if TYPE_CHECKING:
 REBUILD = "Copy or build the model again."
 # A point without its track. The track's elements follow: image id and index of the keypoint, uint32 each.
 POINT = np.dtype([("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("n", "<u8")])
-_FILES = ("cameras", "images", "points3D", "rigs", "frames")
 _UINT32 = Struct("<I")
 _UINT64 = Struct("<Q")
 _MAX_COORDINATE = 1e12  # of a point or a camera; its square is still finite in single precision
-_ROTATION_TOLERANCE = 0.01  # of the entries of R R^T: some tools write few decimals
 # Patterns in pycolmap's errors, and the file that they are about.
 _FILES_BY_ERROR = (
     (r"Camera model|VerifyParams|cameras_|camera\.camera_id", "cameras"),
@@ -90,7 +88,8 @@ def read_points(path: Path) -> tuple[NDArray[Any], NDArray[np.uint32]]:
 @contextmanager
 def without_marks(folder: Path, suffix: str) -> Iterator[Path]:
     """Yield a model's folder, or a copy of its texts without the byte-order marks that pycolmap cannot read."""
-    texts = [path for name in _FILES if (path := folder / (name + suffix)).is_file()] if suffix == ".txt" else []
+    names = ("cameras", "images", "points3D", "rigs", "frames") if suffix == ".txt" else ()
+    texts = [path for name in names if (path := folder / (name + suffix)).is_file()]
     if not any(map(_has_mark, texts)):
         yield folder
         return
@@ -150,7 +149,7 @@ def _is_pose(rigid: Any) -> bool:
     """Whether a `pycolmap.Rigid3d` is a rotation and a translation of usual size."""
     matrix = rigid.matrix()
     with np.errstate(over="ignore", invalid="ignore"):
-        is_rotation = np.abs(matrix[:, :3] @ matrix[:, :3].T - np.eye(3)).max() <= _ROTATION_TOLERANCE
+        is_rotation = np.abs(matrix[:, :3] @ matrix[:, :3].T - np.eye(3)).max() <= 0.01  # some tools write few decimals
     return bool(is_rotation and np.abs(matrix[:, 3]).max() <= _MAX_COORDINATE)
 
 
@@ -193,7 +192,6 @@ _RECORD_LENGTHS = {"images": _image_length, "points3D": _point_length, "frames":
 CAMERAS_FILE = "cameras.npz"  # next to the landmarks; small enough to be shipped without the COLMAP model
 MODEL_FILES = ("cameras", "images", "points3D")
 _SUFFIXES = (".bin", ".txt")
-_LARGE_BYTES = 500e6  # of a model from which on reading it shows a progress bar
 
 
 @dataclass(frozen=True, eq=False)
@@ -240,7 +238,7 @@ def read_model(model_dir: str | Path) -> Any:
     import pycolmap
 
     n_bytes = sum((folder / (name + suffix)).stat().st_size for name in MODEL_FILES)
-    bar = tqdm(total=2, desc=f"model of {n_bytes / 1e9:.1f} GB: read", unit="step", disable=n_bytes < _LARGE_BYTES)
+    bar = tqdm(total=2, desc=f"model of {n_bytes / 1e9:.1f} GB: read", unit="step", disable=n_bytes < 500e6)
     model = pycolmap.Reconstruction()
     with bar, quiet_colmap():
         if suffix == ".bin":

@@ -39,7 +39,6 @@ MAP_ATTRIBUTES = (
 
 
 _BLOCK = 4096  # landmarks whose tracks are gathered at a time
-_PROGRESS_AFTER_S = 2.0
 _TILE = 512  # descriptors along a side of a product that fits into the cache
 
 
@@ -222,7 +221,7 @@ def max_cosine_to_other(descriptors: NDArray[Any], device: str = "cpu", progress
     lengths = torch.as_tensor(np.linalg.norm(descriptors.astype(np.float64), axis=1), device=device)
     inverse = 1 / torch.where(lengths > 0, lengths, 1).float()
     best = torch.full((n,), -torch.inf, device=device)
-    tiles = tqdm(range(0, n, _TILE), "landmarks: ambiguity", delay=_PROGRESS_AFTER_S, unit="tile", disable=not progress)
+    tiles = tqdm(range(0, n, _TILE), "landmarks: ambiguity", delay=2.0, unit="tile", disable=not progress)
     with one_thread():  # products are small: several threads would mostly wait for one another
         for i in tiles:
             for j in range(i, n, _TILE):  # each pair of tiles once: its product serves rows and columns

@@ -34,8 +34,6 @@ from wheretolook.utils.errors import ConfigError, MapError, MapWarning
 from wheretolook.utils.files import path_within, read_json_object
 from wheretolook.utils.texts import LOG
 
-_LEVELS = 4  # folders above a model that are searched: hloc's models are in outputs/sfm/models/0
-
 
 def find_features(model_dir: Path, reconstruction: Any = None) -> Path | None:
     """Find the file of features of a map: hloc's HDF5, COLMAP's database, or the one in its report; None without any.
@@ -102,7 +100,7 @@ def has_image(folder: Path, name: str) -> bool:
 
 def _above(model_dir: Path) -> list[Path]:
     """The folders above a model, the nearest first."""
-    return [*model_dir.absolute().parents[:_LEVELS]]
+    return [*model_dir.absolute().parents[:4]]  # hloc's models are in outputs/sfm/models/0
 
 
 def _kind_or_problem(path: Path, reconstruction: Any) -> tuple[DescriptorKind | None, str]:

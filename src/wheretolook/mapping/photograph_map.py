@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pycolmap
 from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
@@ -19,9 +20,8 @@ from wheretolook.geometry.similarity import Similarity
 from wheretolook.mapping.colmap_model import colmap_poses, describe_cameras, read_model, registered_names, write_model
 from wheretolook.mapping.config import EXHAUSTIVE_UP_TO, MapConfig
 from wheretolook.mapping.georeference import MapScale, MarkedPhotographs, check_tables
-from wheretolook.mapping.gravity import estimate_gravity
 from wheretolook.mapping.map_folder import MapDraft, MapReport, MapRun, finish_map, replacing_map
-from wheretolook.mapping.map_frame import IDENTITY, find_frame
+from wheretolook.mapping.map_frame import IDENTITY, estimate_gravity, find_frame
 from wheretolook.mapping.photographs import (
     PhotographCameras,
     list_photographs,
@@ -37,7 +37,6 @@ from wheretolook.utils.texts import quiet_colmap
 
 _MIN_IMAGES = 3  # of a model: two photographs do not determine a camera
 _MANIFEST = "steps.json"
-_VERSION = 2  # of the format of finished steps
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +73,8 @@ def photograph_features(
     extractor = run.config.extractor
     stats = [(folder / name).stat() for name in names]
     files = [(name, stat.st_size, stat.st_mtime_ns) for name, stat in zip(names, stats, strict=True)]
-    key = cache_key(_VERSION, files, run.config.photographs.max_side_px, extractor.record(), turned)
+    # of the format of finished steps
+    key = cache_key(2, files, run.config.photographs.max_side_px, extractor.record(), turned)
     arrays = _cached_arrays(work, key, "features", lambda: _extract(folder, names, turned, run))
     ends = np.cumsum(arrays["counts"])[:-1]
     pixels, descriptors, colors = (np.split(arrays[name], ends) for name in ("pixels", "descriptors", "colors"))
@@ -156,7 +156,6 @@ def _extract(folder: Path, names: list[str], turned: bool, run: MapRun) -> dict[
 
 def _unposed_model(features: PhotographFeatures, cameras: PhotographCameras) -> Any:
     """Make a reconstruction of photographs and their cameras, without poses."""
-    import pycolmap
 
     model = pycolmap.Reconstruction()
     for camera in cameras.cameras:
@@ -169,7 +168,6 @@ def _unposed_model(features: PhotographFeatures, cameras: PhotographCameras) -> 
 
 def _reconstruct(database: Path, folder: Path, cameras: PhotographCameras, seed: int, run: MapRun) -> list[int]:
     """Verify matches, map, and write the largest model. Returns the number of photographs in each, largest first."""
-    import pycolmap
 
     threads = run.processes.workers
     verification = pycolmap.TwoViewGeometryOptions()
@@ -194,9 +192,6 @@ def _reconstruct(database: Path, folder: Path, cameras: PhotographCameras, seed:
         raise MapError("the photographs do not overlap enough for a map", path=database, fix=fix)
     write_model(ordered[0], folder)
     return [model.num_reg_images() for model in ordered]
-
-
-_FIX = "Raise mapping.photographs.max_reprojection_error_px, or take sharper photographs."
 
 
 @dataclass(frozen=True)
@@ -253,7 +248,8 @@ def map_photographs(
             frame.world_from_map.transform_model(model)
             model.update_point_3d_errors()
         out_dir = Path(out_dir)
-        draft = MapDraft(model, out_dir, settings.max_reprojection_error_px, _FIX, mapped.database, features.colors)
+        fix = "Raise mapping.photographs.max_reprojection_error_px, or take sharper photographs."
+        draft = MapDraft(model, out_dir, settings.max_reprojection_error_px, fix, mapped.database, features.colors)
         landmarks, fields = finish_map(draft, folder, run)
         registered = set(registered_names(model).values())
         report = PhotographMapReport(

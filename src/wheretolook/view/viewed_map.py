@@ -11,13 +11,19 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
+from safetensors import SafetensorError, safe_open
 
+from wheretolook.dataset.layout import Dataset, SceneFolder, find_scene
 from wheretolook.dataset.scene import ColmapFiles, Scene, SceneConfig
 from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.lattices import direction_lattice
 from wheretolook.geometry.poses import Float, camera_centers
-from wheretolook.mapping.config import FrameOptions
+from wheretolook.geometry.views import Views
+from wheretolook.mapping.config import FrameOptions, place_name
+from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.mapping.map_frame import IDENTITY, mesh_warning, warn_of_mesh
+from wheretolook.scorers.registry import check_method, make_scorer, scorers
+from wheretolook.scorers.weights import resolve_weights, weights_by_method
 from wheretolook.utils.errors import MapError, TableError, WhereToLookError
 from wheretolook.utils.package import WEIGHTS, or_shipped, shipped
 from wheretolook.view import drawing
@@ -26,26 +32,18 @@ from wheretolook.view.state import Paths, ViewState
 if TYPE_CHECKING:  # torch and Warp are imported when first needed: the page opens before them
     import pandas as pd
 
-    from wheretolook.dataset.layout import SceneFolder
-    from wheretolook.geometry.views import Views
     from wheretolook.inputs.localization_map import LocalizationMap
-    from wheretolook.mapping.landmarks import Landmarks
     from wheretolook.scorers.base import Scorer
     from wheretolook.select.where_to_look import WhereToLook
 
-FLOOR_CELLS = 1200  # approximate number of cells in a floor's rectangle
-MIN_CELL_M = 0.1
 FLOOR_DIRECTIONS = 96
 """Directions per cell of a floor, 19 degrees apart: the best score is within 0.02 of that of 500 directions, in a third
 of the time."""
 
 FIRST_CELLS = 12  # scored before a floor is drawn
-ABOVE_GROUND_M = 0.03  # above carpets
 BLOCK = 1 << 10  # labelled views scored per step
 
 MAX_SCORERS = 8  # kept in memory; those of large maps take 100 MB each
-MAX_FLOORS = 64
-MAX_MESHES = 4
 DIRECTIONS = 500  # scored at a location, as by `wheretolook select`
 OCCLUSION_BYTES = 1 << 26  # memory for cached lines of sight
 
@@ -105,7 +103,7 @@ def floor_at(selector: WhereToLook, height_m: float) -> Floor:
     """
     space = selector.space
     low, high = np.asarray(space.bounds, dtype=np.float64)[:, :2]
-    cell = max(MIN_CELL_M, float(np.sqrt(np.prod(high - low) / FLOOR_CELLS)))
+    cell = max(0.1, float(np.sqrt(np.prod(high - low) / 1200)))
     columns, rows = (max(1, ceil(length)) for length in (high - low) / cell)
     lower = (low + high) / 2 - np.array([columns, rows]) * cell / 2
     floor = Floor(selector, height_m, lower, cell, (rows, columns), np.arange(rows * columns), height_m)
@@ -114,7 +112,7 @@ def floor_at(selector: WhereToLook, height_m: float) -> Floor:
     cells = np.flatnonzero(free)
     drawn_m = height_m
     if len(cells) and hasattr(space, "floor_below"):
-        drawn_m = float(np.median(space.floor_below(floor.points[cells]))) + ABOVE_GROUND_M
+        drawn_m = float(np.median(space.floor_below(floor.points[cells]))) + 0.03  # above carpets
     order = farthest_first(np.stack(np.divmod(cells, columns), axis=1))
     return Floor(selector, height_m, lower, cell, (rows, columns), cells[order], drawn_m)
 
@@ -173,7 +171,6 @@ class AvailableWeights:
     """
 
     def __init__(self, features: str, own: Mapping[str, Path | None]) -> None:
-        from wheretolook.scorers.weights import weights_by_method
 
         self.files: dict[str, Path] = {}
         self.origins: dict[str, str] = {}
@@ -185,7 +182,6 @@ class AvailableWeights:
 
     def describe(self, method: str) -> str:
         """Describe the weights that a method scores with; empty for a method without weights."""
-        from wheretolook.scorers.registry import scorers
 
         kind = scorers()[method].weights
         return f"weights {self.origins[kind]}: {self.files[kind].name}" if kind in self.files else ""
@@ -193,7 +189,6 @@ class AvailableWeights:
     @property
     def methods(self) -> tuple[str, ...]:
         """Methods that can score with these weights or without any, the preferred one first."""
-        from wheretolook.scorers.registry import scorers
 
         usable = [
             name
@@ -209,9 +204,6 @@ def scene_weights(files: SceneFolder, landmarks: Landmarks) -> dict[str, Path | 
     root = files.folder.parent
     trained = None
     if any((root / "weights").glob("*.safetensors")):
-        from wheretolook.dataset.layout import Dataset
-        from wheretolook.scorers.weights import resolve_weights
-
         trained = resolve_weights(dataset=Dataset.load(root))
         if trained is not None and not trained.is_relative_to(root):
             trained = None
@@ -221,7 +213,6 @@ def scene_weights(files: SceneFolder, landmarks: Landmarks) -> dict[str, Path | 
 
 def map_weights(model: Path, data: Path, landmarks: Landmarks) -> dict[str, Path | None]:
     """Find weights adapted to a COLMAP model by `wheretolook adapt --map`."""
-    from wheretolook.mapping.config import place_name
 
     path = data / "checks" / place_name(model) / "adapted.safetensors"
     return {"adapted to this scene": _if_adapted_to(path, landmarks)}
@@ -231,7 +222,6 @@ def _if_adapted_to(path: Path, landmarks: Landmarks) -> Path | None:
     """Return the path if the file has weights adapted to a scene with these landmarks."""
     if not path.is_file():
         return None
-    from safetensors import SafetensorError, safe_open
 
     from wheretolook.scorers.adapted.score import MIN_SHARE, share_of_place
 
@@ -295,7 +285,6 @@ class ViewedMap:
 
     def is_probability(self, method: str) -> bool:
         """Test whether a method's scores are probabilities, which a threshold applies to."""
-        from wheretolook.scorers.registry import check_method
 
         return check_method(method).probability
 
@@ -312,7 +301,6 @@ class ViewedMap:
         Scorers cache what depends on the directions, so each number of directions has its own. Raises ConfigError for
         an unknown method or occlusion model, WeightsError if the weights cannot be used.
         """
-        from wheretolook.scorers.registry import check_method, make_scorer
         from wheretolook.select.where_to_look import WhereToLook
 
         weights = self.weights.files.get(check_method(method).weights)
@@ -324,12 +312,12 @@ class ViewedMap:
         opened = self.scene.with_occlusion(self.scene.occlusion_model(occlusion))
         return replace(opened, map=replace(opened.map, frame=IDENTITY))  # the viewer selects in the world
 
-    @lru_cache(MAX_FLOORS)  # noqa: B019
+    @lru_cache(64)  # noqa: B019
     def floor(self, method: str, occlusion: str, height_m: float) -> Floor:
         """Return the floor at a height, one object for all clients."""
         return floor_at(self.selector(method, occlusion, FLOOR_DIRECTIONS), height_m)
 
-    @lru_cache(MAX_MESHES)  # noqa: B019
+    @lru_cache(4)  # noqa: B019
     def mesh_glb(self, cut_m: float | None) -> bytes | None:
         """Return the mesh below a height as GLB; None without a mesh."""
         return None if self.mesh is None else drawing.mesh_glb(self.mesh, cut_m)
@@ -411,7 +399,6 @@ def open_scene(
     `dataset.layout.find_scene`, MapError or TableError if the scene has not been mapped, WeightsError if the weights
     cannot be used.
     """
-    from wheretolook.dataset.layout import find_scene
     from wheretolook.dataset.viewpoint_table import CAMERA_ID, UNLABELLED
 
     if not data.is_dir():

@@ -8,21 +8,25 @@ import shutil
 import subprocess
 import sys
 import tomllib
+from collections.abc import Iterator
 from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
+import yaml
 
+import wheretolook
 from box_scenes import furnished_room
 from selection.room import write_room
-from wheretolook.cli import main, parse_command
+from wheretolook.cli import COMMANDS, command_options, command_targets, load_command, main, parse_command
 from wheretolook.dataset.layout import Dataset
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.mapping.colmap_model import colmap_poses
 from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.scenes.loading import save_glb
+from wheretolook.utils import errors
 from wheretolook_paper.figures.photograph_paths import photograph_paths_markdown, read_photograph_paths
 from wheretolook_paper.release.numbers import Numbers, pages, updated
 
@@ -164,12 +168,13 @@ NUMBERS = Numbers(ROOT)
 @pytest.mark.parametrize("page", pages(NUMBERS))
 def test_numbers_are_those_of_the_results(page: str) -> None:
     assert (ROOT / page).read_text() == updated(page, NUMBERS), (
-        "python -m wheretolook_paper.studies.results --only pages"
+        "python -m wheretolook_paper.studies.results --only '[pages]'"
     )
 
 
 def test_a_changed_result_changes_the_page(tmp_path: Path) -> None:
     shutil.copytree(ROOT / "data" / "release" / "results", tmp_path / "data" / "release" / "results")
+    shutil.copy(ROOT / "data" / "release" / "README.md", tmp_path / "data" / "release")
     shutil.copytree(ROOT / "docs", tmp_path / "docs")
     path = tmp_path / "data" / "release" / "results" / "looks.csv"
     table = pd.read_csv(path)
@@ -188,3 +193,59 @@ def test_the_table_of_paths_on_photographs_is_that_of_the_release() -> None:
     missing = [cells for cells in made if cells not in page and set(cells[1]) != {"-"}]
     assert len(made) == 8 and not missing
     assert set(landmarks["scene"]) == set(table["scene"])
+
+
+# --- options
+
+
+def test_options_are_few_and_each_is_in_a_page_configuration_or_notebook() -> None:
+    sources = [*PAGES, *(ROOT / "docs" / "research").glob("*.md"), *(ROOT / "notebooks").glob("*.py")]
+    text = "\n".join(path.read_text() for path in sources)
+    configured = {
+        name for path in (ROOT / "configs").glob("*.yaml") for name in dotted(yaml.safe_load(path.read_text()))
+    }
+    options: dict[str, set[str]] = {}
+    for command in map(load_command, command_targets()):
+        for name in command_options(command):
+            options.setdefault(name, {name}).update(short for short, full in command.SHORT.items() if full == name)
+    missing = []
+    for option, names in options.items():
+        written = [rf"--{re.escape(name).replace('_', '[-_]')}(?![\w.-])" for name in names]
+        written += [rf"(?<![\w.-]){re.escape(name)}(?!\w)" for name in names if "." in name]
+        if option not in configured and not re.search("|".join(written), text):
+            missing.append(option)
+    assert missing == [] and len(options) <= 180
+
+
+def dotted(settings: dict[str, object], prefix: str = "") -> Iterator[str]:
+    """Yield the dotted names of nested settings."""
+    for key, value in settings.items():
+        yield f"{prefix}{key}"
+        if isinstance(value, dict):
+            yield from dotted(value, f"{prefix}{key}.")
+
+
+# --- the public names
+
+
+def test_the_page_of_the_interface_lists_what_is_public() -> None:
+    documented = set()
+    commands = set()
+    for name, options in re.findall(
+        r"^::: ([\w.]+)\n((?:    .*\n)*)", (ROOT / "docs" / "api.md").read_text() + "\n", re.M
+    ):
+        members = re.search(r"members: \[(.*)\]", options)
+        if name == "wheretolook.utils.errors":
+            documented |= {
+                known
+                for known, value in vars(errors).items()
+                if isinstance(value, type) and issubclass(value, Exception)
+            }
+        elif name.startswith("wheretolook.commands."):
+            commands.add(name)
+        else:
+            documented |= set(members[1].split(", ")) if members else {name.rpartition(".")[2]}
+    assert documented == set(wheretolook.__all__) - {"__version__"}
+    assert commands == {target.replace(":", ".") for target in COMMANDS.values()}
+    home = {name: getattr(wheretolook, name).__module__ for name in documented}
+    assert all(home[name] == wheretolook._HOMES[name] for name in documented), home

@@ -98,7 +98,7 @@ def main() -> None:
     directions = fibonacci_sphere(args.directions)
 
     mapped = LocalizationMap(Map(landmarks), room.camera, occlusion, args.device)
-    scorer = load_scorer(args.weights, mapped) if args.weights else make_scorer("bins", mapped)
+    scorer = load_scorer(mapped, args.weights) if args.weights else make_scorer("bins", mapped)
     print(f"{len(free)} voxels x {len(directions)} directions, {len(landmarks):,} landmarks, "
           f"{len(mesh.triangles):,} triangles, {scorer.name}, on {args.device}, "
           f"{cores()} cores")  # fmt: skip

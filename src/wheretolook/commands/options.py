@@ -292,10 +292,10 @@ class Experiment(SceneOptions, LabelOptions):
     tracking: TrackingConfig = field(default_factory=TrackingConfig)
 
 
-def select_options(command: type[T], options: object) -> T:
-    """Return a command with those of its options that another command's options include."""
+def select_options(command: type[T], options: object, **given: Any) -> T:
+    """Return a command with the given options, and those of its others that another command's options include."""
     names = [field.name for field in fields(command) if hasattr(options, field.name)]  # type: ignore[arg-type]
-    return command(**{name: getattr(options, name) for name in names})
+    return command(**{**{name: getattr(options, name) for name in names}, **given})
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -35,8 +35,7 @@ class BuildViewpointMap(SceneOrMapOptions):
         viewpoint_map: which views, and how they are scored.
     """
 
-    SHORT: ClassVar = {name: f"viewpoint_map.{name}" for name in ("scene", "method", "weights", "accuracy", "out")}
-
+    GROUPS: ClassVar = {"viewpoint_map": ""}
     WRITES: ClassVar = "viewpoint_map.json"
 
     viewpoint_map: ViewpointMapConfig = field(default_factory=ViewpointMapConfig)

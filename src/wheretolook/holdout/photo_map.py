@@ -27,7 +27,7 @@ from wheretolook.mapping.colmap_model import (
     registered_names,
     select_points,
 )
-from wheretolook.mapping.config import ExistingModelConfig, FrameOptions, MapConfig, PhotographsConfig, place_name
+from wheretolook.mapping.config import FrameOptions, ImportConfig, place_name
 from wheretolook.mapping.feature_files import DATABASE_FILE, read_descriptors
 from wheretolook.mapping.georeference import DEPTH_M, median_depths
 from wheretolook.mapping.imported_map import map_existing
@@ -296,10 +296,8 @@ def features_of(
         return out, out / DATABASE_FILE
     _check_photographs(model, model_dir)
     shutil.rmtree(out, ignore_errors=True)
-    existing = ExistingModelConfig(model=model_dir)
     own = FrameOptions(scale=1, up="z")
-    photographs = PhotographsConfig(images=images)
-    config = MapConfig(frame=own, existing=existing, photographs=photographs, extractor=extractor, keep_database=True)
+    config = ImportConfig(images, model=model_dir, frame=own, extractor=extractor, keep_database=True)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", MapWarning)  # about the frame, which `open_map` corrects
         map_existing(config, out, work / "photographs", workers=workers, device=device, reconstruction=model)

@@ -126,7 +126,7 @@ def mesh_warning(points: ArrayLike, raycaster: MeshRaycaster) -> str:
     return (
         f"half of the landmarks are {far} from the mesh, so it seems to be in another frame or unit than the model. "
         "Export both in the same frame and unit; a mesh with y up (glTF's own) `wheretolook map --model` "
-        "turns with --mapping.existing.mesh_up y"
+        "turns with --mesh-up y"
     )
 
 

@@ -27,7 +27,7 @@ from wheretolook.geometry.poses import Float
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.landmarks import MAP_ATTRIBUTES, Landmarks
 from wheretolook.scorers.set.accuracy import AccuracyModel
-from wheretolook.scorers.set.network import CELLS, SetNetwork
+from wheretolook.scorers.set.network import CELLS, SetNetwork, ViewSums, expected_parts
 from wheretolook.scorers.set.score import MAX_LANDMARKS, for_map
 from wheretolook.training.trained_network import TrainedNetwork, camera_quantities
 from wheretolook.utils.errors import CameraError, MapError
@@ -36,25 +36,22 @@ from wheretolook.utils.package import VERSION
 
 OPSET = 17  # of 2022: onnxruntime 1.12 and later reads the file
 IR_VERSION = 8
-INPUTS = ("values", "taken", "n_visible", "axis_height")
+INPUTS = ("values", "taken", "n_visible")
 OUTPUTS = ("probability", "expected_inliers")
 
 
-def pose_variances(information: Tensor) -> tuple[Tensor, Tensor]:
+def pose_variances(information: Tensor) -> Tensor:
     """Invert information matrices (B, 6, 6) by Gauss-Jordan elimination, since ONNX has no Cholesky decomposition.
 
-    Returns the diagonals of the inverses (B, 6) and the logarithms of the determinants (B,). Positive definite matrices
-    need no pivoting.
+    Returns the diagonals of the inverses (B, 6). Positive definite matrices need no pivoting.
     """
     unit = torch.eye(6, dtype=information.dtype)
     rows = torch.cat([information, unit.expand_as(information)], dim=-1)
-    log_det = torch.zeros_like(information[:, 0, 0])
     for k in range(6):
         pivot = rows[:, k, k]
-        log_det = log_det + pivot.log()
         row = (rows[:, k] / pivot[:, None])[:, None]
         rows = torch.where(unit[k, :, None] > 0, row, rows - rows[:, :, k, None] * row)
-    return (rows[:, :, 6:] * unit).sum(-1), log_det
+    return (rows[:, :, 6:] * unit).sum(-1)
 
 
 TAIL = (
@@ -99,16 +96,13 @@ class RobotNetwork(nn.Module):
         single = np.where(single < exact, np.nextafter(single, np.float32(np.inf)), single)
         self.register_buffer("borders", torch.from_numpy(single))
 
-    def forward(
-        self, values: Tensor, n_sampled: Tensor, n_visible: Tensor, axis_height: Tensor
-    ) -> tuple[Tensor, Tensor]:
+    def forward(self, values: Tensor, n_sampled: Tensor, n_visible: Tensor) -> tuple[Tensor, Tensor]:
         """Score B views.
 
         Args:
             values: (B, K, A) float32, attributes of at most K landmarks of each view.
             n_sampled: (B,) int64, number of these landmarks that are the view's.
             n_visible: (B,) int64, number of visible landmarks.
-            axis_height: (B,) float32, z of the optical axis in the world.
 
         Returns:
             Probabilities to localize (B,) float64 and expected inliers (B,) float32.
@@ -117,13 +111,12 @@ class RobotNetwork(nn.Module):
         log_odds = network.matchability(values)
         own = torch.arange(values.shape[1]) < n_sampled[:, None]
         each = (n_visible.double() / n_sampled.clamp(min=1))[:, None]  # visible landmarks per sampled one
-        sums = (network.parts(values, log_odds).double() * own[..., None]).sum(1) * each
+        sums = (expected_parts(values, log_odds, network.attributes).double() * own[..., None]).sum(1) * each
         is_own = self.accuracy == self.trained.accuracy
-        cells = self._expected_cells(values, log_odds, own, each) if network.needs_cells or not is_own else None
-        view = sums, n_visible, axis_height, cells
-        probability = self.trained.calibrated(network.logits(*view).double()).sigmoid()
+        views = ViewSums(sums, n_visible, self._expected_cells(values, log_odds, own, each))
+        probability = self.trained.calibrated(network.logits(views).double()).sigmoid()
         if not is_own:
-            known = self.trained.accuracy, probability, network.statistics_of(*view).double()
+            known = self.trained.accuracy, probability, network.statistics_of(views).double()
             probability = AccuracyModel.bundled().at(self.accuracy, *known, torch, log_ndtr)
         return probability, sums[:, 0].float()
 
@@ -148,7 +141,7 @@ def set_graph(trained: TrainedNetwork[SetNetwork], accuracy: Accuracy) -> Any:
     with warnings.catch_warnings(action="ignore"):  # the default exporter needs another package
         torch.onnx.export(
             RobotNetwork(trained, accuracy),
-            (*example, torch.zeros(2)),
+            example,
             file,
             dynamo=False,
             opset_version=OPSET,

@@ -54,7 +54,7 @@ FORMAT_VERSION = 1  # of the folder
 MIN_DEPTH_M = 2.0**-10  # landmarks with a smaller depth are not visible
 CAMERA = ("width", "height", "fx", "fy", "cx", "cy")
 COMPUTED = {"across", "down", "distance", "mapped_angle", "distance_ratio", "pixel_angle", "pixel_size_ratio"}
-INPUTS = {"values", "taken", "n_visible", "axis_height"}
+INPUTS = {"values", "taken", "n_visible"}
 OUTPUTS = ("probability", "expected_inliers")
 FREE_BYTES = 128_000_000  # that landmarks.npz may expand to, whatever its size
 MAX_RATIO = 100  # of its expanded to its stored bytes
@@ -283,7 +283,6 @@ class RobotScorer:
                 if len(rows):
                     distance_m[view] = np.exp(own[:, distance].mean())
             inputs = {"values": padded, "taken": counts, "n_visible": n_visible[block]}
-            inputs["axis_height"] = rotations[block, 2, 2].astype(np.float32)
             score[block], inliers[block] = self._session.run(OUTPUTS, inputs)
         in_range = self._serves_camera & self._within("distance_m", distance_m)
         in_range &= (n_visible == 0) | self._within("in_view", n_visible)

@@ -53,6 +53,7 @@ from wheretolook_paper.figures.photograph_paths import (
     photograph_paths_figure,
     photograph_paths_markdown,
 )
+from wheretolook_paper.studies.tables import replace_rows
 
 GRID = (8, 8, 4)
 DIRECTIONS = 200
@@ -182,20 +183,12 @@ def main(
     landmarks.insert(0, "scene", source.name)
     print(photograph_paths_markdown(table))
     if out is not None:
-        write_rows(table, out, 4)
-        write_rows(landmarks, out.with_name(LANDMARKS_CSV), 3)
+        replace_rows(out, table.round(4), ["scene"])
+        replace_rows(out.with_name(LANDMARKS_CSV), landmarks.round(3), ["scene"])
     if figure is not None:
         shown = table["image"].unique() if images is not None else ()
         pictures = {image: read_photograph(images / image)[::2, ::2] for image in shown}
         save_figure(photograph_paths_figure(table, landmarks, pictures), figure)
-
-
-def write_rows(rows: pd.DataFrame, path: Path, decimals: int) -> None:
-    """Write the rows of a scene to a CSV file, in place of those of the same scene that it has."""
-    others = pd.read_csv(path) if path.is_file() else rows[:0]
-    path.parent.mkdir(parents=True, exist_ok=True)
-    rows = pd.concat([others[~others["scene"].isin(rows["scene"])], rows]).sort_values("scene", kind="stable")
-    rows.round(decimals).to_csv(path, index=False)
 
 
 if __name__ == "__main__":

@@ -13,6 +13,7 @@ import pandas as pd
 import pytest
 
 from all_options import AllOptions, run
+from fixed_fields import with_fields
 from learning_options import changed, train_config
 from synthetic_dataset import CAMERA, make_dataset
 from wheretolook.cli import parse_command
@@ -119,7 +120,7 @@ def test_weights_in_half_precision_score_as_before(finished: Path, tmp_path: Pat
     convert_to_float16(halved)
     assert halved.stat().st_size < 0.55 * weights.stat().st_size
     scores = [
-        load_scorer(path, scene.localization_map()).score(poses(scene.read_table())) for path in (weights, halved)
+        load_scorer(scene.localization_map(), path).score(poses(scene.read_table())) for path in (weights, halved)
     ]
     np.testing.assert_allclose(*scores, atol=0.01)
 
@@ -236,7 +237,7 @@ def test_the_shipped_card_is_of_what_ships(shipped: Dataset) -> None:
         record = json.loads(path.with_suffix(".json").read_text())
         assert record["metrics"]["val_average_precision"] > least
     scene = shipped.split("test")[0]
-    assert load_scorer(shipped.root / "weights", scene.localization_map(shipped.camera)).name == "set"
+    assert load_scorer(scene.localization_map(shipped.camera), shipped.root / "weights").name == "set"
     assert sum(path.stat().st_size for path in (shipped.root / "weights").glob("*.safetensors")) < 10e6
 
 
@@ -245,11 +246,11 @@ def test_the_shipped_weights_score_as_the_card_says(shipped: Dataset, tmp_path: 
     shutil.copytree(shipped.root, tmp_path / "data" / "release")
     experiment = parse_command(
         "evaluate", ["--config", str(CONFIGS / "release.yaml"), "--data", str(tmp_path / "data"), "--device", "cpu",
-                     "--tracking.folder", str(tmp_path / "mlruns"), "--evaluate.resamples", "2",
+                     "--tracking.folder", str(tmp_path / "mlruns"),
                      "--evaluate.methods", "[random,visible,bins,fisher-logdet-exact,mlp]",
                      "--evaluate.occlusions", "[]"]
     )  # fmt: skip
-    assert experiment is not None
+    experiment = with_fields(experiment, {"evaluate.resamples": 2})
     scores = run(Evaluate, experiment, log=quiet)
     said = pd.read_csv(shipped.root / "results" / "scores.csv")
     said = said[said["occlusion"] == "mesh"].merge(scores[["method"]].drop_duplicates()).reset_index(drop=True)

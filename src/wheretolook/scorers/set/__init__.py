@@ -8,7 +8,7 @@ from math import inf
 from wheretolook.inputs.channels import ATTRIBUTES, OF_SIZE
 from wheretolook.scorers.registry import Learner, Method, imported, network_scorer
 from wheretolook.training.config import FittingConfig, check_range
-from wheretolook.utils.errors import ConfigError
+from wheretolook.utils.errors import ConfigError, no_option
 
 
 @dataclass(frozen=True)
@@ -23,10 +23,10 @@ class LandmarksConfig(FittingConfig):
         enlarged: maximum factor by which scenes are scaled up or down in training; 1 does not scale them.
     """
 
-    landmarks: int = 64
-    width: int = 48
-    hidden: tuple[str, ...] = OF_SIZE
-    enlarged: float = 3.0
+    landmarks: int = no_option(64)
+    width: int = no_option(48)
+    hidden: tuple[str, ...] = no_option(OF_SIZE)
+    enlarged: float = no_option(3.0)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -42,8 +42,8 @@ class LandmarksConfig(FittingConfig):
 class MatchabilityConfig(LandmarksConfig):
     """Options of the probability that a visible landmark is detected."""
 
-    epochs: int = 6
-    batch_size: int = 256
+    epochs: int = no_option(6)
+    batch_size: int = no_option(256)
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,6 @@ class SetConfig(LandmarksConfig):
 
     Args:
         landmark_loss: weight of the loss of landmark detection, where matches are stored.
-        pooled: features that attention pools in addition to the expected information on the pose.
         head: units of the head's layers.
         dropout: share of the head's units dropped.
         from_matchability: start from `weights/matchability.safetensors` where the dataset has it.
@@ -63,17 +62,16 @@ class SetConfig(LandmarksConfig):
     epochs: int = 8
     batch_size: int = 1024
     learning_rate: float = 3e-3
-    landmarks: int = 192
-    landmark_loss: float = 0.5
-    pooled: int = 0
-    head: int = 48
-    dropout: float = 0.1
-    from_matchability: bool = True
+    landmarks: int = no_option(192)
+    landmark_loss: float = no_option(0.5)
+    head: int = no_option(48)
+    dropout: float = no_option(0.1)
+    from_matchability: bool = no_option(True)
 
     def __post_init__(self) -> None:
         super().__post_init__()
         check_range(self, "head", at_least=1)
-        check_range(self, "landmark_loss", "pooled", at_least=0)
+        check_range(self, "landmark_loss", at_least=0)
         check_range(self, "dropout", at_least=0, below=1)
 
     @property

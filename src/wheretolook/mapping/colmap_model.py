@@ -189,6 +189,7 @@ def _frame_length(data: bytes, start: int) -> int:
 _RECORD_LENGTHS = {"images": _image_length, "points3D": _point_length, "frames": _frame_length}
 
 
+LANDMARKS_FILE = "landmarks.npz"  # in the folder of a map of this project
 CAMERAS_FILE = "cameras.npz"  # next to the landmarks; small enough to be shipped without the COLMAP model
 MODEL_FILES = ("cameras", "images", "points3D")
 _SUFFIXES = (".bin", ".txt")

@@ -250,8 +250,8 @@ class SceneRound:
     @cached_property
     def _localizer(self) -> Localizer:
         from wheretolook.localization.localizer import Localizer
+        from wheretolook.mapping.colmap_model import LANDMARKS_FILE
         from wheretolook.mapping.landmarks import Landmarks
-        from wheretolook.mapping.map_folder import LANDMARKS_FILE
         from wheretolook_paper.benchmark.query_map import build_query_map
 
         folder = self.folder / MAP_FOLDER

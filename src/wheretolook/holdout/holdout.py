@@ -179,8 +179,6 @@ def _landmarks_without(observes: csr_array, group: NDArray[np.int64]) -> int:
 
 
 MIN_ANGLE_DEG = 1.5  # COLMAP's own minimum angle between the rays of a landmark
-_LANDMARKS = "landmarks.npz"
-_VIEWS = "views.json"
 
 
 @dataclass(frozen=True, eq=False)
@@ -320,8 +318,8 @@ def _run(job: _BlockJob) -> None:
     )
     job.cache.folder.mkdir(parents=True, exist_ok=True)
     job.cache.clear()
-    replace(landmarks, descriptors=None).save(job.cache.folder / _LANDMARKS)
-    job.cache.store({_VIEWS: views.to_dict("list")})
+    replace(landmarks, descriptors=None).save(job.cache.folder / "landmarks.npz")
+    job.cache.store({"views.json": views.to_dict("list")})
 
 
 def _observed(image: Any, source: PhotographedMap, row: int, crop: int) -> NDArray[np.int64]:
@@ -369,10 +367,10 @@ def _localize(job: _BlockJob, landmarks: Landmarks) -> pd.DataFrame:
 
 def _load(cache: ArtifactCache, block: Block) -> HoldoutResult | None:
     """Read the cached result of a block; None if there is none, or it is unreadable."""
-    results = cache.load(_VIEWS)
+    results = cache.load("views.json")
     if results is None:
         return None
     try:
-        return HoldoutResult(block, Landmarks.load(cache.folder / _LANDMARKS), pd.DataFrame(results[_VIEWS]))
+        return HoldoutResult(block, Landmarks.load(cache.folder / "landmarks.npz"), pd.DataFrame(results["views.json"]))
     except (MapError, ValueError):
         return None

@@ -72,7 +72,6 @@ MAX_ERROR_M, MAX_ERROR_DEG = THRESHOLDS[0]  # below both, a photograph counts as
 CHECKS = "checks"  # folder of the folders of checks, next to the datasets
 WORK = "work"  # folder of cached work, in that of a check
 MIN_PHOTOGRAPHS = 8  # with fewer, blocks are too small
-MIN_OBSERVED = 10  # landmarks that the median photograph observes
 
 
 @dataclass(frozen=True, eq=False)
@@ -213,8 +212,9 @@ def open_map(
     arrays = model_arrays(model)
     own_centers = camera_centers(arrays.image_poses)
     observed = float(np.median(np.bincount(arrays.observation_image, minlength=len(own_centers))))
-    if observed < MIN_OBSERVED:
-        problem = f"half of the photographs observe fewer than {MIN_OBSERVED} landmarks"
+    min_observed = 10
+    if observed < min_observed:
+        problem = f"half of the photographs observe fewer than {min_observed} landmarks"
         fix = "Give a model with tracks, and the photographs it was made from."
         raise MapError(problem, path=model_dir, value=observed, fix=fix)
     original = model if source in (None, model_dir) else read_model(source)

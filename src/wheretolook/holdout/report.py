@@ -339,10 +339,6 @@ def _with_interval(measured: dict[str, float | None], digits: int, scale: float 
     return value if measured["low"] is None else f"{value} [{low}, {high}]"
 
 
-_GOOD = BLUE
-_BAD = VERMILION
-
-
 def check_figure(report: CheckReport) -> Figure:
     """Draw the map from above with all photographs, and predictions against results for views and for blocks.
 
@@ -373,8 +369,8 @@ def _draw_map(axes: Axes, report: CheckReport) -> None:
     axes.scatter(points[::step, 0], points[::step, 1], s=1, color="#c4c4c4", linewidths=0, rasterized=True, zorder=1)
     length = 0.035 * float((high - low).max())
     localized = report.photographs["localized"].to_numpy(dtype=float, na_value=np.nan)
-    kinds = [(np.isnan(localized), "#999999", "not tested"), (localized == 1, _GOOD, "localized")]
-    kinds.append((localized == 0, _BAD, "not localized"))
+    kinds = [(np.isnan(localized), "#999999", "not tested"), (localized == 1, BLUE, "localized")]
+    kinds.append((localized == 0, VERMILION, "not localized"))
     for mask, color, label in kinds:
         if not mask.any():
             continue
@@ -388,7 +384,7 @@ def _draw_map(axes: Axes, report: CheckReport) -> None:
         middle = np.median(centers[part.rows, :2], axis=0)
         out = np.median(looks[part.rows, :2], axis=0) * -2.2 * length
         style: dict[str, Any] = {"arrowstyle": "-", "color": INK, "linewidth": 0.8}
-        box: dict[str, Any] = {"boxstyle": "circle,pad=0.2", "facecolor": "white", "edgecolor": _BAD}
+        box: dict[str, Any] = {"boxstyle": "circle,pad=0.2", "facecolor": "white", "edgecolor": VERMILION}
         axes.annotate(
             str(part.number), tuple(middle), tuple(middle + out), fontsize=9, ha="center", va="center", zorder=5,
             arrowprops=style, bbox=box,
@@ -417,7 +413,7 @@ def _draw_calibration(axes: Axes, report: CheckReport) -> None:
     views = report.views
     if numbers["ece"] is None:
         good = views["good"].to_numpy(dtype=bool)
-        for mask, color, label in ((good, _GOOD, "localized"), (~good, _BAD, "not localized")):
+        for mask, color, label in ((good, BLUE, "localized"), (~good, VERMILION, "not localized")):
             axes.hist(views["score"][mask], bins=20, color=color, alpha=0.6, label=label)
         axes.set(xlabel=f"score of {report.method}", ylabel="views", title="scores")
         axes.legend()
@@ -426,9 +422,9 @@ def _draw_calibration(axes: Axes, report: CheckReport) -> None:
     curve = reliability(views["score"].to_numpy(), views["good"].to_numpy(dtype=bool), 10)
     known = curve[curve["n"] > 0]
     axes.plot([0, 1], [0, 1], color=INK, linewidth=1, linestyle="--")
-    axes.plot(known["mean_predicted"], known["share_good"], color=_GOOD, zorder=3)
+    axes.plot(known["mean_predicted"], known["share_good"], color=BLUE, zorder=3)
     sizes = 12 + 140 * known["n"] / known["n"].max()
-    axes.scatter(known["mean_predicted"], known["share_good"], s=sizes, color=_GOOD, zorder=3, clip_on=False)
+    axes.scatter(known["mean_predicted"], known["share_good"], s=sizes, color=BLUE, zorder=3, clip_on=False)
     axes.set(xlim=(0, 1), ylim=(0, 1), xlabel="predicted probability", ylabel="share that localizes")
     axes.set_title(f"calibration error {numbers['ece']['value']:.2f}")
 
@@ -444,7 +440,7 @@ def _draw_inliers(axes: Axes, report: CheckReport) -> None:
     good = views["good"].to_numpy(dtype=bool)
     most = 1.3 * max(float(expected.max(initial=1)), float(n_inliers.max(initial=1)), 10.0)
     axes.plot([1, most], [1, most], color=INK, linewidth=1, linestyle="--")
-    for mask, color in ((good, _GOOD), (~good, _BAD)):
+    for mask, color in ((good, BLUE), (~good, VERMILION)):
         axes.scatter(
             np.maximum(expected[mask], 0.5), np.maximum(n_inliers[mask], 0.5), s=9, color=color, alpha=0.6, linewidths=0
         )
@@ -455,7 +451,7 @@ def _draw_inliers(axes: Axes, report: CheckReport) -> None:
 def _draw_blocks(axes: Axes, report: CheckReport) -> None:
     blocks = report.blocks
     at = np.arange(len(blocks))
-    axes.bar(at, blocks["share_localized"], color=_GOOD, alpha=0.45, width=0.7, label="share that localizes")
+    axes.bar(at, blocks["share_localized"], color=BLUE, alpha=0.45, width=0.7, label="share that localizes")
     if report.numbers["ece"] is not None:
         axes.plot(at, blocks["mean_score"], color=INK, marker="o", linestyle="", markersize=5, label="predicted")
     axes.set_xticks(at, [f"{row.left_out}" for row in blocks.itertuples()])

@@ -39,20 +39,12 @@ POINT = np.dtype([("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", 
 _UINT32 = Struct("<I")
 _UINT64 = Struct("<Q")
 _MAX_COORDINATE = 1e12  # of a point or a camera; its square is still finite in single precision
-# Patterns in pycolmap's errors, and the file that they are about.
-_FILES_BY_ERROR = (
-    (r"Camera model|VerifyParams|cameras_|camera\.camera_id", "cameras"),
-    ("point2D.point3D_id|line_stream[12]|utf-8", "images"),
-    ("Image with ID|vector::|point3D.xyz", "points3D"),
-    ("rig_from_world|data_id|unordered_map", "frames"),
-    ("[Rr]ig|[Cc]amera|[Ss]ensor", "rigs"),
-    ("[Ff]rame", "frames"),
-)
 
 
 def check_binary(folder: Path) -> None:
     """Raise MapError if counts in a folder's binary model do not match the files' sizes, or a point is not finite."""
-    for name, record_length in _RECORD_LENGTHS.items():
+    lengths = {"images": _image_length, "points3D": _point_length, "frames": _frame_length}
+    for name, record_length in lengths.items():
         path = folder / f"{name}.bin"
         if path.is_file():  # models from before COLMAP 3.12 have no frames
             data = path.read_bytes()
@@ -168,7 +160,15 @@ def _record_starts(data: bytes, record_length: Callable[[bytes, int], int], path
 
 def model_error(error: Exception, folder: Path, suffix: str) -> MapError:
     """Convert an error of pycolmap about a model's files to a MapError that names the file, where the error does."""
-    name = next((name for pattern, name in _FILES_BY_ERROR if re.search(pattern, str(error))), None)
+    files_by_error = (  # patterns in pycolmap's errors, and the file that they are about
+        (r"Camera model|VerifyParams|cameras_|camera\.camera_id", "cameras"),
+        ("point2D.point3D_id|line_stream[12]|utf-8", "images"),
+        ("Image with ID|vector::|point3D.xyz", "points3D"),
+        ("rig_from_world|data_id|unordered_map", "frames"),
+        ("[Rr]ig|[Cc]amera|[Ss]ensor", "rigs"),
+        ("[Ff]rame", "frames"),
+    )
+    name = next((name for pattern, name in files_by_error if re.search(pattern, str(error))), None)
     path = folder / f"{name}{suffix}" if name else folder
     return MapError(f"pycolmap cannot read the model: {error}", path=path, fix=REBUILD)
 
@@ -186,13 +186,9 @@ def _frame_length(data: bytes, start: int) -> int:
     return 68 + 16 * int(_UINT32.unpack_from(data, start + 64)[0])
 
 
-_RECORD_LENGTHS = {"images": _image_length, "points3D": _point_length, "frames": _frame_length}
-
-
 LANDMARKS_FILE = "landmarks.npz"  # in the folder of a map of this project
 CAMERAS_FILE = "cameras.npz"  # next to the landmarks; small enough to be shipped without the COLMAP model
 MODEL_FILES = ("cameras", "images", "points3D")
-_SUFFIXES = (".bin", ".txt")
 
 
 @dataclass(frozen=True, eq=False)
@@ -216,7 +212,7 @@ class ModelArrays:
 def model_suffix(model_dir: str | Path) -> str:
     """Suffix of the model's files in a folder: ".bin" or ".txt". Raises MapError if the model is missing or incomplete."""
     folder = Path(model_dir)
-    suffix = next((s for s in _SUFFIXES if any((folder / (n + s)).is_file() for n in MODEL_FILES)), None)
+    suffix = next((s for s in (".bin", ".txt") if any((folder / (n + s)).is_file() for n in MODEL_FILES)), None)
     if suffix is None:
         inside = [str(path.parent) for path in sorted(folder.glob("**/images.*")) if holds_model(path.parent)][:5]
         examples = f", such as {', '.join(inside)}" if inside else ""
@@ -392,7 +388,7 @@ def describe_cameras(reconstruction: Any) -> list[dict[str, Any]]:
 
 def holds_model(folder: Path) -> bool:
     """Whether a folder holds a COLMAP model, binary or text."""
-    return any(all((folder / (name + suffix)).is_file() for name in MODEL_FILES) for suffix in _SUFFIXES)
+    return any(all((folder / (name + suffix)).is_file() for name in MODEL_FILES) for suffix in (".bin", ".txt"))
 
 
 def save_mapping_poses(cam_from_world: Float, path: str | Path) -> None:

@@ -18,8 +18,6 @@ from wheretolook.mapping.colmap_model import read_model
 from wheretolook.utils.errors import SceneError, check_positive
 from wheretolook.utils.files import MAX_DEPTH_PIXELS, load_npy, read_image
 
-MAX_MEASURED = 50  # images that the scale is measured in
-
 
 def read_depth(path: Path, scale: float = 1000.0) -> NDArray[np.float32]:
     """Read a depth image (H, W) in metres, 0 without a reading: PNG or TIFF (integers of `scale` a metre, or floats in
@@ -63,11 +61,11 @@ def read_depth_images(model: Path, folder: Path, scale: float = 1000.0) -> list[
 def metres_per_unit(model: Path, folder: Path, scale: float = 1000.0) -> float | None:
     """Return the metres in a unit of a COLMAP model by its depth images; arguments are those of `read_depth_images`.
 
-    It is the median ratio of the depth at keypoints to that of their landmarks, of up to `MAX_MEASURED` images; None
+    It is the median ratio of the depth at keypoints to that of their landmarks, of up to 50 images; None
     if no keypoint of a landmark has a depth.
     """
     reconstruction = read_model(model)
-    step = -(-reconstruction.num_images() // MAX_MEASURED)
+    step = -(-reconstruction.num_images() // 50)
     ratios = []
     for image, depth_m in _depth_of_images(reconstruction, folder, scale, step):
         observed = image.get_observation_points2D()

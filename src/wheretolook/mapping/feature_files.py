@@ -23,7 +23,6 @@ from wheretolook.utils.files import check_file, max_expanded_bytes
 DATABASE_FILE = "database.db"  # COLMAP's usual name
 HDF5_SUFFIXES = (".h5", ".hdf5")
 _KIND_TABLE = "wheretolook_features"  # of a database: the name of the kind of its descriptors
-_TABLES = ("images", "keypoints", "descriptors", _KIND_TABLE)
 _FIX = "Give the file of features that the model was built from, or none."
 
 
@@ -214,7 +213,7 @@ def _kind_in_table(database: sqlite3.Connection) -> DescriptorKind | None:
     """
     named = None
     for schema, name, table_type, *_ in database.execute("PRAGMA table_list").fetchall():
-        if schema == "main" and str(name).lower() in _TABLES:
+        if schema == "main" and str(name).lower() in ("images", "keypoints", "descriptors", _KIND_TABLE):
             columns = database.execute(f'PRAGMA table_xinfo("{name}")').fetchall()
             if table_type != "table" or any(column["hidden"] for column in columns):
                 raise ValueError(f"{name} is not a plain table")

@@ -26,8 +26,6 @@ if TYPE_CHECKING:
     import pycolmap
 
 
-_SAMPLES = 32  # profiles across an edge
-
 # A marker is rejected if the root mean square reprojection error of its corners exceeds both this many pixels and this
 # share of the photographs' longer side. That of a marker that was moved, or printed twice, is tens of pixels.
 
@@ -193,14 +191,15 @@ def _edge_line(grey: NDArray[np.uint8], start: Float, end: Float, inside: Float)
         normal = -normal
     half = float(np.clip(length / 16, 1.5, 6.0))  # within the black frame, a sixth to a tenth of the marker
     across = np.linspace(-half, half, 2 * round(half * 4) + 1)
-    share = np.linspace(0.15, 1 - 0.15, _SAMPLES)  # where neighbouring edges blur into it
+    n_profiles = 32
+    share = np.linspace(0.15, 1 - 0.15, n_profiles)  # where neighbouring edges blur into it
     middle = start + share[:, None] * along
     at = (middle[:, None] + across[:, None] * normal).astype(np.float32)
     profile = cv2.remap(grey.astype(np.float32), at[..., 0], at[..., 1], cv2.INTER_LINEAR, None, cv2.BORDER_REPLICATE)
     rise = np.maximum(np.diff(profile, axis=1), 0)
     total = rise.sum(1)
     strong = total > max(10.0, 0.5 * float(np.median(total)))
-    if strong.sum() < _SAMPLES // 2:
+    if strong.sum() < n_profiles // 2:
         return None
     offset = (rise[strong] @ ((across[1:] + across[:-1]) / 2)) / total[strong]
     typical = np.abs(offset - np.median(offset))

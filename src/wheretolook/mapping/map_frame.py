@@ -32,7 +32,6 @@ if TYPE_CHECKING:
     from wheretolook.rendering.raycasting import MeshRaycaster
 
 
-_ITERATIONS = 50
 _MIN_RESIDUAL = np.sin(np.radians(0.5))  # limits the weights
 
 
@@ -84,7 +83,7 @@ def rotation_to_z(up: ArrayLike) -> Float:
 def _level_direction(axes: Float) -> Float | None:
     """The direction most nearly perpendicular to unit axes (M, 3); None if they do not determine it."""
     weights = np.ones(len(axes))
-    for _ in range(_ITERATIONS):
+    for _ in range(50):
         values, vectors = np.linalg.eigh((axes.T * weights) @ axes / weights.sum())
         weights = 1 / np.maximum(np.abs(axes @ vectors[:, 0]), _MIN_RESIDUAL)
     least, middle = np.sqrt(np.maximum(values[:2], 0))
@@ -95,15 +94,13 @@ def _level_direction(axes: Float) -> Float | None:
 def _median_direction(directions: Float) -> Float:
     """The unit vector with nearly the least sum of angles to unit vectors (M, 3): Weiszfeld's iteration on a sphere."""
     at: Float = directions.mean(0)
-    for _ in range(_ITERATIONS):
+    for _ in range(50):
         at = at / max(float(np.linalg.norm(at)), 1e-12)
         weights = 1 / np.maximum(np.linalg.norm(directions - at, axis=1), _MIN_RESIDUAL)
         at = (directions * weights[:, None]).sum(0) / weights.sum()
     return at / max(float(np.linalg.norm(at)), 1e-12)
 
 
-SPACING_M = 5.0
-"""Largest plausible median distance from a mapping camera to the nearest other one."""
 MESH_DISTANCE_M = (0.3, 100.0)
 """Largest plausible median distance of landmarks to a mesh, and the farthest distance that is measured."""
 LOOKING_DOWN = 0.7  # mean of the cameras' axes along -z above which their roll does not determine up
@@ -140,11 +137,12 @@ def scale_warning(mapping_distance_m: ArrayLike, centers: ArrayLike) -> str:
     distance = float(np.median(np.asarray(mapping_distance_m)))
     at = np.asarray(centers, dtype=np.float64)
     spacing = float(np.median(cKDTree(at).query(at, 2)[0][:, 1])) if len(at) > 1 else 0.0
+    max_spacing_m = 5.0
     low, high = 0.2, 50.0  # from tabletops to plazas
-    if low <= distance <= high and spacing <= SPACING_M:
+    if low <= distance <= high and spacing <= max_spacing_m:
         return ""
     lengths = f"landmarks are {distance:.3g} m from the cameras that mapped them, and these {spacing:.3g} m from the "
-    lengths += f"nearest other (medians); plausible are {low:g} to {high:g} m, and at most {SPACING_M:g} m"
+    lengths += f"nearest other (medians); plausible are {low:g} to {high:g} m, and at most {max_spacing_m:g} m"
     fix = "Correct --scale, --distance or --positions. Ignore this warning if it is metric"
     return f"the model seems not to be in metres: {lengths}. {fix}"
 
@@ -163,9 +161,6 @@ def up_axis_warning(cam_from_world: ArrayLike) -> str:
         f"the cameras are {how}: the up direction estimated from their orientations is ({up}), {off_deg:.0f} degrees from z, which is "
         "up here. --up level turns it upright. Ignore this warning if the cameras were held so"
     )
-
-
-MAX_TILT_DEG = 60.0  # median angle between a given up and the images' own, beyond which no camera was held like that
 
 
 @dataclass(frozen=True, eq=False)
@@ -334,7 +329,7 @@ def _upright(
     rotation = rotation_to_z(up)
     off_deg = np.degrees(np.arccos(np.clip(-poses[:, 1, :3] @ rotation[2], -1, 1)))
     looking_down = (poses[:, 2, :3] @ rotation[2]).mean() < -LOOKING_DOWN
-    if rotation[2, 2] != 1 and np.median(off_deg) > MAX_TILT_DEG and not looking_down:
+    if rotation[2, 2] != 1 and np.median(off_deg) > 60 and not looking_down:  # no camera was held like that
         problem = (
             f"no camera agrees with this direction up: half were held {np.median(off_deg):.0f} degrees off or more"
         )

@@ -35,7 +35,6 @@ from wheretolook.utils.errors import ConfigError, MapError
 from wheretolook.utils.files import ArtifactCache, cache_key, storing_in_database, temporary_folder
 from wheretolook.utils.texts import quiet_colmap
 
-_MIN_IMAGES = 3  # of a model: two photographs do not determine a camera
 _MANIFEST = "steps.json"
 
 
@@ -169,11 +168,12 @@ def _unposed_model(features: PhotographFeatures, cameras: PhotographCameras) -> 
 def _reconstruct(database: Path, folder: Path, cameras: PhotographCameras, seed: int, run: MapRun) -> list[int]:
     """Verify matches, map, and write the largest model. Returns the number of photographs in each, largest first."""
 
+    min_images = 3  # two photographs do not determine a camera
     threads = run.processes.workers
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = seed
     options = pycolmap.IncrementalPipelineOptions(random_seed=seed, num_threads=threads, extract_colors=False)
-    options.min_model_size = _MIN_IMAGES
+    options.min_model_size = min_images
     options.ba_refine_focal_length = options.ba_refine_extra_params = not cameras.given
     options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = not cameras.given
     options.triangulation.random_seed = options.mapper.random_seed = seed
@@ -187,7 +187,7 @@ def _reconstruct(database: Path, folder: Path, cameras: PhotographCameras, seed:
         mapped = pycolmap.incremental_mapping(str(database), str(models), str(models), options, **steps)
     ordered = sorted(mapped.values(), key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
     if not ordered:
-        fix = f"Give at least {_MIN_IMAGES} sharp photographs from different places, each of which overlaps the next;"
+        fix = f"Give at least {min_images} sharp photographs from different places, each of which overlaps the next;"
         fix += " a focal length (mapping.photographs.camera_params) helps."
         raise MapError("the photographs do not overlap enough for a map", path=database, fix=fix)
     write_model(ordered[0], folder)

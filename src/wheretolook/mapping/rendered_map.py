@@ -34,8 +34,6 @@ from wheretolook.rendering.warp_renderer import Renderer
 from wheretolook.utils.errors import ConfigError, SceneError
 from wheretolook.utils.files import write_bytes
 
-_LOOK_AHEAD_M = 1.0  # the camera points to where the walk is after this distance
-
 
 class FreeSpaceQueries(Protocol):
     """The part of `wheretolook.space.free_space.FreeSpace` that a walk uses."""
@@ -201,8 +199,9 @@ def _along(path: Float, n_images: int, rng: np.random.Generator, unevenness: flo
     def point(s: Float) -> Float:
         return np.stack([np.interp(s, start, path[:, k]) for k in range(3)], axis=1)
 
-    behind = np.maximum(np.minimum(at, start[-1] - _LOOK_AHEAD_M), 0)
-    heading = (point(behind + _LOOK_AHEAD_M) - point(behind))[:, :2]
+    ahead_m = 1.0  # of the point that the camera looks at, along the walk
+    behind = np.maximum(np.minimum(at, start[-1] - ahead_m), 0)
+    heading = (point(behind + ahead_m) - point(behind))[:, :2]
     length = np.linalg.norm(heading, axis=1)
     angle = rng.uniform(0, 2 * np.pi)
     last = np.array([np.cos(angle), np.sin(angle)])
@@ -221,9 +220,6 @@ def _swing(headings: Float, rng: np.random.Generator) -> Float:
     yaw = yaw + np.radians(WALK.swing_deg * np.sin(phase) + rng.normal(0, 5, n))
     pitch = np.radians(WALK.pitch_deg + WALK.pitch_variation_deg * rng.uniform(-1, 1, n))
     return np.column_stack([np.cos(pitch) * np.cos(yaw), np.cos(pitch) * np.sin(yaw), np.sin(pitch)])
-
-
-_RENDER_BATCH = 4
 
 
 @dataclass(frozen=True)
@@ -333,8 +329,9 @@ def _rendered(
     Images are written to a folder if one is given, and depth is added to `depth`.
     """
 
-    for start in range(0, len(poses), _RENDER_BATCH):
-        rendering = renderer.render(camera, poses[start : start + _RENDER_BATCH])
+    batch = 4
+    for start in range(0, len(poses), batch):
+        rendering = renderer.render(camera, poses[start : start + batch])
         for index, (rgb, depth_m) in enumerate(zip(rendering.rgb, rendering.depth_m, strict=True), start):
             depth.append(shrink_depth(depth_m))
             if drawn:

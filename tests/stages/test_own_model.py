@@ -24,7 +24,7 @@ from wheretolook.commands.viewpoint_map import BuildViewpointMap
 from wheretolook.dataset.layout import Dataset, SceneFolder
 from wheretolook.dataset.sampling_config import SampleConfig
 from wheretolook.dataset.scene import Scene
-from wheretolook.features.config import ExtractorConfig
+from wheretolook.features.extractor import ExtractorConfig
 from wheretolook.geometry.camera import CameraConfig, PinholeCamera
 from wheretolook.geometry.poses import camera_centers, poses_looking_along
 from wheretolook.geometry.views import Views

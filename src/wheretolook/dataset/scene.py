@@ -270,7 +270,6 @@ class Scene:
     @cached_property
     def tsdf_volume(self) -> TsdfVolume:
         """The truncated signed distance field fused from the depth images."""
-
         occlusion = self.config.occlusion
         tsdf = TsdfConfig(voxel_size_m=occlusion.voxel_m, max_depth_m=occlusion.max_depth_m)
         return TsdfVolume.from_images(self.depth_images, tsdf, self.progress)

@@ -265,7 +265,6 @@ def without(model: Any, image_ids: Sequence[int]) -> Any:
     again from the others; it is dropped if it has fewer than two, if its rays meet at less than `MIN_ANGLE_DEG`, or if
     it reprojects worse than any landmark of the whole map.
     """
-
     rest = pycolmap.Reconstruction(model)
     before = {number: point.track.length() for number, point in rest.points3D.items()}
     worst_px = max((point.error for point in rest.points3D.values() if point.has_error()), default=np.inf)
@@ -298,7 +297,6 @@ def _model(folder: Path) -> Any:
 
 def _run(job: _BlockJob) -> None:
     """Hold out a block, localize its photographs, and store the result."""
-
     torch.set_num_threads(1)
     whole = _model(job.model)
     image_ids = job.source.arrays.image_ids

@@ -117,7 +117,6 @@ def _triangulate(source: Any, images: Path, features: PhotographFeatures, databa
 
 def _posed_model(source: Any, features: PhotographFeatures) -> Any:
     """A reconstruction with the same cameras, names and poses, at the size of the features; image i has the id i + 1."""
-
     model = pycolmap.Reconstruction()
     sizes = dict[int, list[int]]()
     images = [source.images[number] for number in registered_names(source)]
@@ -182,7 +181,6 @@ def _are_turned(model: Any, folder: Path) -> bool:
 
 def _size(path: Path) -> tuple[int, int, bool]:
     """Width and height of a photograph as stored, and whether its EXIF orientation swaps them."""
-
     try:
         width, height = image_size(path)
         with Image.open(path) as photograph:

@@ -154,7 +154,6 @@ def _extract(folder: Path, names: list[str], turned: bool, max_side_px: int, run
 
 def _unposed_model(features: PhotographFeatures, cameras: PhotographCameras) -> Any:
     """Make a reconstruction of photographs and their cameras, without poses."""
-
     model = pycolmap.Reconstruction()
     for camera in cameras.cameras:
         model.add_camera_with_trivial_rig(camera)
@@ -166,7 +165,6 @@ def _unposed_model(features: PhotographFeatures, cameras: PhotographCameras) -> 
 
 def _reconstruct(database: Path, folder: Path, cameras: PhotographCameras, seed: int, run: MapRun) -> list[int]:
     """Verify matches, map, and write the largest model. Returns the number of photographs in each, largest first."""
-
     min_images = 3  # two photographs do not determine a camera
     threads = run.processes.workers
     verification = pycolmap.TwoViewGeometryOptions()

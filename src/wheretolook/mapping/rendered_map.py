@@ -299,7 +299,6 @@ def build_map(  # a scene has four parts, and the output and its resources are t
 
 def _distance_cm(points: Float, mesh: TexturedMesh, raycaster: MeshRaycaster | None) -> Float:
     """Distances (N,) in centimetres from points (N, 3) to a mesh."""
-
     limit_m = float(np.linalg.norm(mesh.bounds[1] - mesh.bounds[0]))
     return 100.0 * (raycaster or MeshRaycaster(mesh)).distance_to_surface(points, limit_m).astype(np.float64)
 
@@ -328,7 +327,6 @@ def _rendered(
 
     Images are written to a folder if one is given, and depth is added to `depth`.
     """
-
     batch = 4
     for start in range(0, len(poses), batch):
         rendering = renderer.render(camera, poses[start : start + batch])

@@ -59,7 +59,6 @@ def extract_with_colors(
 
 def posed_model(camera: PinholeCamera, cam_from_world: NDArray[np.floating[Any]]) -> Any:
     """Make a reconstruction of images of one camera at poses (I, 3, 4), without keypoints; image i has the id i + 1."""
-
     model = pycolmap.Reconstruction()
     model.add_camera_with_trivial_rig(pycolmap.Camera(camera_id=1, **camera.colmap.record()))
     for index, pose in enumerate(np.asarray(cam_from_world, dtype=np.float64)):
@@ -84,7 +83,6 @@ def triangulate_model(
 
     Returns a `pycolmap.Reconstruction`, not yet filtered by reprojection error.
     """
-
     clock = run.clock
     folder = database.parent
     kind = kind_of(run.config.extractor.method)
@@ -124,7 +122,6 @@ def triangulate_model(
 
 def write_matches(database: Path, pairs: NDArray[np.int64], matches: Iterable[NDArray[np.uint32]]) -> None:
     """Write matches (M, 2) of each pair (P, 2) of images into a COLMAP database; image i has the id i + 1."""
-
     with pycolmap.Database.open(str(database)) as db:
         for (i, j), matched in zip(pairs.tolist(), matches, strict=True):
             db.write_matches(i + 1, j + 1, matched)
@@ -201,7 +198,6 @@ def fill_database(database: Path, model: Any, stored: Iterable[Stored], kind: De
 
     Descriptors that are not bytes are stored in single precision, as COLMAP 4 does.
     """
-
     colmap_type = pycolmap.FeatureExtractorType(kind.colmap_type)
     with pycolmap.Database.open(str(database)) as db:
         for camera in model.cameras.values():

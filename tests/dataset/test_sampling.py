@@ -7,8 +7,8 @@ import pandas as pd
 import pytest
 
 from synthetic_dataset import make_landmarks
+from wheretolook.dataset.config import SampleConfig
 from wheretolook.dataset.sampling import sample_viewpoints
-from wheretolook.dataset.sampling_config import SampleConfig
 from wheretolook.dataset.viewpoint_files import SCHEMA
 from wheretolook.dataset.viewpoint_table import poses
 from wheretolook.geometry.camera import PinholeCamera

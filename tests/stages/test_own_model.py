@@ -21,8 +21,8 @@ from wheretolook.commands.options import MapUseOptions, ScenesConfig, extractor_
 from wheretolook.commands.plan import Plan
 from wheretolook.commands.sample import Sample
 from wheretolook.commands.viewpoint_map import BuildViewpointMap
+from wheretolook.dataset.config import SampleConfig
 from wheretolook.dataset.layout import Dataset, SceneFolder
-from wheretolook.dataset.sampling_config import SampleConfig
 from wheretolook.dataset.scene import Scene
 from wheretolook.features.extractor import ExtractorConfig
 from wheretolook.geometry.camera import CameraConfig, PinholeCamera

@@ -10,8 +10,7 @@ from functools import wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeVar, get_args
 
-from wheretolook.dataset.config import RELEASE_FILE
-from wheretolook.dataset.sampling_config import SampleConfig
+from wheretolook.dataset.config import RELEASE_FILE, SampleConfig
 from wheretolook.features.extractor import ExtractorConfig
 from wheretolook.geometry.camera import Camera, CameraConfig, describe_camera
 from wheretolook.localization.config import LabelConfig

@@ -10,7 +10,7 @@ import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
-from wheretolook.dataset.sampling_config import SampleConfig
+from wheretolook.dataset.config import SampleConfig
 from wheretolook.dataset.viewpoint_table import CAMERA_ID, UNLABELLED, pose_columns
 from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.lattices import VoxelGrid

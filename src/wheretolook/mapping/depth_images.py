@@ -45,10 +45,10 @@ def read_depth_images(model: Path, folder: Path, scale: float = 1000.0) -> list[
     """
     reconstruction = read_model(model)
     cameras = cameras_by_id(reconstruction.cameras, model)
-    rectify = cache(lambda camera_id, size: _rectified(cameras[camera_id], *size))
+    rectify = cache(_rectified)
     images = []
     for image, depth_m in _depth_of_images(reconstruction, folder, scale):
-        camera, shown = rectify(image.camera_id, depth_m.shape[::-1])
+        camera, shown = rectify(cameras[image.camera_id], depth_m.shape[::-1])
         if shown is not None:
             depth_m = np.append(depth_m, np.float32(0))[shown]
         images.append(DepthImage(depth_m, camera, image.cam_from_world().matrix()))
@@ -101,11 +101,12 @@ def _depth_of_images(
             yield image, depth_m
 
 
-def _rectified(camera: Camera, width: int, height: int) -> tuple[PinholeCamera, NDArray[np.int64] | None]:
-    """Return the pinhole of a camera's rectified images of another size, and which pixel of an image each pixel shows.
+def _rectified(camera: Camera, shape: tuple[int, ...]) -> tuple[PinholeCamera, NDArray[np.int64] | None]:
+    """Return the pinhole of a camera's rectified images of another width and height, and the pixel that each one shows.
 
     These are (height, width) rows of the flat image, width * height outside of it; None for a camera without distortion.
     """
+    width, height = shape
     is_pinhole = isinstance(camera, PinholeCamera) or camera.model in ("SIMPLE_PINHOLE", "PINHOLE")
     fx = fy = camera.mean_focal_px
     if is_pinhole:

@@ -155,11 +155,13 @@ def up_axis_warning(cam_from_world: ArrayLike) -> str:
     # people roll a camera by a few degrees, but may tilt all their photographs of an object
     if off_deg <= {"level": 25.0, "mean": 50.0}[gravity.method] or poses[:, 2, 2].mean() < -LOOKING_DOWN:
         return ""
-    how = "upside down" if off_deg > 135 else "on their side" if off_deg > 45 else "askew"
-    up = " ".join(f"{value:.2f}" for value in np.round(gravity.up, 2) + 0.0)  # no -0.00
+    how = "on their side" if off_deg > 45 else "askew"
+    if off_deg > 135:
+        how = "upside down"
     return (
-        f"the cameras are {how}: the up direction estimated from their orientations is ({up}), {off_deg:.0f} degrees from z, which is "
-        "up here. --up level turns it upright. Ignore this warning if the cameras were held so"
+        f"the cameras are {how}: the up direction estimated from their orientations is ({_rounded(gravity.up)}), "
+        f"{off_deg:.0f} degrees from z, which is up here. --up level turns it upright. Ignore this warning if the "
+        "cameras were held so"
     )
 
 

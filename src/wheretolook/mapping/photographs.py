@@ -108,14 +108,14 @@ def photograph_cameras(
     rows: dict[Any, int] = {}
     cameras: list[pycolmap.Camera] = []
     camera_of = []
-    for name, full, reduced in zip(names, full_sizes.tolist(), sizes.tolist(), strict=True):
+    for name, full, (width, height) in zip(names, full_sizes.tolist(), sizes.tolist(), strict=True):
         camera = _camera(folder / name, full, config)
         shared = (str(Path(name).parent), *full, round(camera.mean_focal_length(), 3))
         row = rows.setdefault(shared if config.shared_camera else name, len(cameras))
         camera_of.append(row)
         if row == len(cameras):
             camera.camera_id = len(cameras) + 1
-            camera.rescale(*reduced)
+            camera.rescale(width, height)
             cameras.append(camera)
     return PhotographCameras(cameras, np.array(camera_of, dtype=np.int64), len(config.camera_params) > 0)
 

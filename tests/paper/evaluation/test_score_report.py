@@ -67,6 +67,8 @@ def test_occlusion_models_and_candidates_are_compared(scores: pd.DataFrame) -> N
     fewer = fewer[fewer["method"] != "mlp-2d"]
     everything = pd.concat([scores, fewer, other])
     pd.testing.assert_frame_equal(main_rows(everything), scores)
+    photographs = make_scores(seed=3).assign(candidates="photographs")
+    assert "## Photographs" in score_markdown(pd.concat([scores, photographs]))
     report = comparisons_markdown(everything)
     for heading, value, table in (("By occlusion", "none", other), ("By set of candidates", "best 100", fewer)):
         row = one_row(table, "random")

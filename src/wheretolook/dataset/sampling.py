@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
@@ -16,14 +15,12 @@ from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.lattices import VoxelGrid
 from wheretolook.geometry.poses import Float, camera_centers, poses_looking_along, rotation_looking_along
 from wheretolook.mapping.landmarks import Landmarks
+from wheretolook.space.free_space import FreeSpace
+from wheretolook.space.mapped_space import MappedSpace
 from wheretolook.utils.devices import fitting
 from wheretolook.utils.errors import ConfigError, SceneError
 from wheretolook.visibility.counting import Survey, SurveyOptions, survey
 from wheretolook.visibility.occlusion import OcclusionModel, StoredOcclusion
-
-if TYPE_CHECKING:
-    from wheretolook.space.free_space import FreeSpace
-    from wheretolook.space.mapped_space import MappedSpace
 
 
 def free_locations(grid: VoxelGrid, free_space: FreeSpace | MappedSpace) -> NDArray[np.int64]:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from functools import lru_cache
 from io import StringIO
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -22,10 +22,6 @@ from wheretolook.utils.errors import ConfigError, MapError
 from wheretolook.utils.files import read_json_object, read_text
 from wheretolook.utils.texts import LOG
 
-if TYPE_CHECKING:
-    import pycolmap
-
-
 # A marker is rejected if the root mean square reprojection error of its corners exceeds both this many pixels and this
 # share of the photographs' longer side. That of a marker that was moved, or printed twice, is tens of pixels.
 
@@ -35,7 +31,7 @@ class MarkerView:
     """A view of a marker in a photograph with a known pose."""
 
     image: str  # the photograph's name
-    camera: pycolmap.Camera
+    camera: Any  # `pycolmap.Camera`
     cam_from_world: Float  # (3, 4)
     corners_px: Float  # (4, 2), clockwise from the marker's top left; (0.5, 0.5) is the centre of the top-left pixel
 

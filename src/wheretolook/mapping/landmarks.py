@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
@@ -18,10 +18,6 @@ from wheretolook.mapping.colmap_model import ModelArrays, model_arrays, read_mod
 from wheretolook.mapping.feature_files import read_descriptors
 from wheretolook.utils.errors import MapError, MapWarning
 from wheretolook.utils.files import load_npz, save_npz
-
-if TYPE_CHECKING:
-    import pycolmap
-
 
 MAP_ATTRIBUTES = (
     "track_length",  # logarithm of the number of observations
@@ -135,7 +131,7 @@ def load_colmap_landmarks(
     database: str | Path | None = None,
     max_reprojection_error_px: float | None = None,
     device: str = "cpu",
-    reconstruction: pycolmap.Reconstruction | None = None,
+    reconstruction: Any = None,
     progress: bool = True,
     arrays: ModelArrays | None = None,
     ambiguity: bool = True,

@@ -40,6 +40,7 @@ if TYPE_CHECKING:  # torch and Warp are imported when first needed: the page ope
 FIRST_CELLS = 12  # scored before a floor is drawn
 
 CONFIG = SceneConfig(occlusion_cache_bytes=1 << 26)  # memory for lines of sight
+BLOCK = 1 << 10  # labelled views scored per step
 MAX_SCORERS = 8  # kept in memory; those of large maps take 100 MB each
 
 
@@ -151,9 +152,8 @@ def score_location(selector: WhereToLook, position: Float, n: int) -> ScoredLoca
 def score_in_blocks(scorer: Scorer, cam_from_world: Float) -> Generator[None, None, Float]:
     """Score poses (B, 3, 4) block by block; the generator returns the scores (B,)."""
     scores = np.empty(len(cam_from_world))
-    block = 1024
-    for begin in range(0, len(scores), block):
-        rows = slice(begin, begin + block)
+    for begin in range(0, len(scores), BLOCK):
+        rows = slice(begin, begin + BLOCK)
         scores[rows] = scorer.score(cam_from_world[rows])
         yield
     return scores

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
+from scipy.spatial import cKDTree
 
 from wheretolook.dataset.layout import Dataset, SceneFolder, find_scene
 from wheretolook.dataset.scene import ColmapFiles, Scene, SceneConfig
@@ -83,8 +84,6 @@ class Floor:
 
     def raster(self) -> Float:
         """Return scores (rows, columns), NaN outside free space; cells not yet scored have the nearest one's score."""
-        from scipy.spatial import cKDTree
-
         values = np.full(self.shape, np.nan)
         if self.n_scored:
             _, nearest = cKDTree(self.points[: self.n_scored]).query(self.points)
@@ -167,7 +166,6 @@ class AvailableWeights:
     """
 
     def __init__(self, features: str, own: Mapping[str, Path | None]) -> None:
-
         self.files: dict[str, Path] = {}
         self.origins: dict[str, str] = {}
         for origin, place in {**own, "bundled with wheretolook": shipped(WEIGHTS)}.items():
@@ -215,14 +213,13 @@ def _if_adapted_to(path: Path, landmarks: Landmarks) -> Path | None:
     """Return the path if the file has weights adapted to a scene with these landmarks."""
     if not path.is_file():
         return None
-
-    from wheretolook.scorers.adapted.score import MIN_SHARE, share_of_place
-
     try:
         with safe_open(path, framework="np") as file:
             place = file.get_tensor("place")
     except (SafetensorError, OSError):
         return None
+    from wheretolook.scorers.adapted.score import MIN_SHARE, share_of_place  # loads PyTorch
+
     return path if share_of_place(place, landmarks.points) >= MIN_SHARE else None
 
 
@@ -293,10 +290,10 @@ class ViewedMap:
         Scorers cache what depends on the directions, so each number of directions has its own. Raises ConfigError for
         an unknown method or occlusion model, WeightsError if the weights cannot be used.
         """
-        from wheretolook.select.where_to_look import WhereToLook
-
         weights = self.weights.files.get(check_method(method).weights)
         scorer = make_scorer(method, self._localization_map(occlusion), weights=weights)
+        from wheretolook.select.where_to_look import WhereToLook  # loads PyTorch: the page opens before it does
+
         return WhereToLook(scorer, direction_lattice(directions), self.space)
 
     @lru_cache(MAX_SCORERS)  # noqa: B019
@@ -406,6 +403,8 @@ def open_scene(
     labels = None
     if camera is None and files.table.is_file():
         table = files.read_table()
+        from wheretolook.dataset.viewpoint_table import CAMERA_ID, UNLABELLED
+
         shown = table["status"] != UNLABELLED
         if CAMERA_ID in table:
             shown &= table[CAMERA_ID] == number

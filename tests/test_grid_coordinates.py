@@ -10,8 +10,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from box_scenes import ROOM, furnished_room
-from mapping.conftest import BoxFreeSpace, box_room
+from box_scenes import ROOM, box_room, furnished_room
 from planning.rooms import CAMERA, DIRECTIONS, GRID, free_voxels, room_landmarks
 from selection.room import POINTS, WEIGHTS, write_room
 from twins.open3d_renderer import Open3DRenderer
@@ -201,17 +200,9 @@ def test_a_colmap_model_gives_the_same_views(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_a_map_is_triangulated_as_well(tmp_path: Path) -> None:
     mesh = replace(box_room(), origin=SHIFT)
-
-    class There(BoxFreeSpace):
-        def is_free(self, points):
-            return super().is_free(np.asarray(points) - SHIFT)
-
-        def floor_below(self, points):
-            return super().floor_below(np.asarray(points) - SHIFT) + SHIFT[2]
-
     config = MapConfig(n_images=12)
     camera = PinholeCamera(320, 240, 160.0)
-    scene = mesh, WarpRenderer(mesh), There()
+    scene = mesh, WarpRenderer(mesh), FreeSpace(mesh)
     report = build_map(*scene, camera, config, 0, tmp_path / "map", workers=1, progress=False)
     assert report.n_landmarks > 200 and report.median_distance_to_mesh_cm < 1
 

@@ -318,7 +318,7 @@ def test_planned_paths_are_rendered_and_localized(copy: Path, capsys: pytest.Cap
     assert run("compare-paths", copy, *options, paths__min_distance_m=1) == 0
     assert "reusing" in capsys.readouterr().out and (root / "paths" / "views.parquet").read_bytes() == before
     assert len(list(finished_runs(TrackingConfig(str(copy / "mlruns")), "paths"))) == 1  # nothing new to log
-    assert run("compare-paths", copy, "--paths.scenes", "[nowhere]", paths__min_distance_m=1) == 2
+    assert run("compare-paths", copy, "--in-scenes", "[nowhere]", paths__min_distance_m=1) == 2
 
 
 def test_a_camera_at_an_unknown_pose_turns_until_it_is_localized(copy: Path) -> None:

@@ -26,7 +26,6 @@ from wheretolook_paper.figures.dollhouse import Dollhouse, dollhouse, draw_house
 
 FRAME_MS = 220
 LAST_MS = 2500  # the last frame
-MAX_FRAMES = 60
 MIN_PROBABILITY = 0.3  # of drawn landmarks; all visible ones would cover the image
 
 
@@ -70,7 +69,7 @@ def _frames(viewed: ViewedMap, state: ViewState) -> Iterator[drawing.Rgb]:
         paths.append(_FilmedPath(name, path, np.asarray(good)))
     heights = camera_centers(paths[1].path.cam_from_world)[:, 2]
     house = dollhouse(viewed.mesh, elevation_deg=62, cut_m=float(heights.max()) + 0.3, width_px=700)
-    n_frames = min(max(len(filmed.path) for filmed in paths), MAX_FRAMES)
+    n_frames = min(max(len(filmed.path) for filmed in paths), 60)
     for share in tqdm(np.linspace(0, 1, n_frames), desc="film", unit="frame"):
         with context(RC):
             figure = new_figure(7.6, 4.3)

@@ -13,7 +13,7 @@ from wheretolook.tracking.runs import ui_command
 from wheretolook.tracking.store import TrackingConfig, check_store
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.files import temporary_folder
-from wheretolook_paper.figures.config import FiguresConfig
+from wheretolook_paper.commands.figures import FiguresConfig
 
 if TYPE_CHECKING:
     from wheretolook.dataset.layout import Dataset

@@ -10,8 +10,7 @@ import pytest
 
 from synthetic_scores import KEYS, make_scores
 from wheretolook.evaluation.results import main_rows
-from wheretolook_paper.evaluation.comparisons import comparisons_markdown
-from wheretolook_paper.evaluation.score_report import score_markdown
+from wheretolook_paper.evaluation.score_report import comparisons_markdown, score_markdown
 
 FINEST = KEYS[0]
 

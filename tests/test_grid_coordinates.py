@@ -161,7 +161,7 @@ def test_scores_are_the_same_by_every_method() -> None:
         Map(far_landmarks(landmarks), mapping_poses=far_poses(known)), CAMERA, MeshOcclusion(MeshRaycaster(far_room()))
     )
     released = {"set": "set", "expected-inliers": "matchability", "mlp-2d+z": "mlp-2d+z"}
-    rules = [name for name, method in scorers().items() if method.learn is None and not method.weights]
+    rules = [name for name, method in scorers().items() if method.learner is None and not method.weights]
     for name in (*rules, *released):
         # random numbers are drawn from the pose; and turns about the world's origin are, as the name says
         if name in ("random", "forward") or name.endswith("-origin"):

@@ -6,17 +6,20 @@ import numpy as np
 import pytest
 
 from wheretolook.evaluation.config import EvaluateConfig
-from wheretolook.evaluation.ranking import RankedViews, choose_at_random, choose_best, choose_oracle, rank_views
+from wheretolook.evaluation.ranking import choose_at_random, choose_best, choose_oracle, rank_views
 from wheretolook.evaluation.results import reference_method, score_table, threshold_keys
+from wheretolook.geometry.views import Views
 from wheretolook.utils.errors import ConfigError
 
-HAND = RankedViews(
+LOCATION = np.array([2, 0, 0, 1, 0, 2, 0, 2])
+HAND = Views(
+    np.zeros((8, 3, 4)),
     # location 0 has four views, location 1 has one, location 2 has three, in mixed order
-    location=np.array([2, 0, 0, 1, 0, 2, 0, 2]),
+    waypoint=LOCATION,
     viewpoint_id=np.array([5, 12, 11, 9, 10, 6, 13, 7]),
     good=np.array([[1, 1], [0, 1], [1, 1], [0, 0], [0, 0], [0, 1], [1, 1], [0, 0]], dtype=bool),
-    location_scene=np.array([0, 0, 1]),
-    location_block=np.arange(3),
+    scene=np.array([0, 0, 1])[LOCATION],
+    block=LOCATION,
 )
 HAND_SCORES = np.array([0.2, 0.9, 0.5, 0.1, 0.5, 0.2, 0.4, 0.9])
 
@@ -27,7 +30,15 @@ def random_views(rng, n_locations=40):
     quality = rng.random(len(location))
     good = quality[:, None] < [0.3, 0.5]
     scene = np.sort(rng.integers(0, 3, n_locations))
-    return RankedViews(location[order], np.arange(len(location))[order], good[order], scene, np.arange(n_locations))
+    views = Views(
+        np.zeros((len(location), 3, 4)),
+        waypoint=location,
+        viewpoint_id=np.arange(len(location)),
+        good=good,
+        scene=scene[location],
+        block=location,
+    )
+    return views[order]
 
 
 @pytest.mark.parametrize(
@@ -49,8 +60,8 @@ def test_best_views_by_hand(n, chosen, good):
 
 
 def test_ties_do_not_depend_on_the_order_of_rows():
-    order = np.random.default_rng(0).permutation(len(HAND.location))
-    shuffled = HAND.only(order)
+    order = np.random.default_rng(0).permutation(len(HAND))
+    shuffled = HAND[order]
     for n in (1, 2, 3):
         expected = choose_best(HAND, rank_views(HAND, np.zeros(8)), n).good
         np.testing.assert_array_equal(choose_best(shuffled, rank_views(shuffled, np.zeros(8)), n).good, expected)
@@ -63,7 +74,7 @@ def test_nothing_beats_the_oracle():
         oracle = choose_oracle(views, n).good
         truth = choose_best(views, rank_views(views, views.good.sum(1).astype(float)), n).good
         np.testing.assert_array_equal(truth, oracle)  # nested thresholds: one order is best by all of them
-        assert np.all(choose_best(views, rank_views(views, rng.random(len(views.location))), n).good <= oracle)
+        assert np.all(choose_best(views, rank_views(views, rng.random(len(views.waypoint))), n).good <= oracle)
         assert np.all(choose_at_random(views, n).good <= oracle + 1e-12)
 
 
@@ -71,7 +82,7 @@ def test_nothing_beats_the_oracle():
 def test_random_choice_by_enumeration(n):
     top = choose_at_random(HAND, n)
     for location in range(3):
-        good = HAND.good[HAND.location == location]
+        good = HAND.good[HAND.waypoint == location]
         draws = [good[list(rows)] for rows in combinations(range(len(good)), min(n, len(good)))]
         np.testing.assert_allclose(top.good[location], np.mean([draw.sum(0) for draw in draws], axis=0))
         np.testing.assert_allclose(top.any_good[location], np.mean([draw.any(0) for draw in draws], axis=0), atol=1e-12)
@@ -152,8 +163,8 @@ def test_reference_method():
 
 def test_a_scene_without_candidates_has_no_shares():
     config = EvaluateConfig(top_n=(1,), thresholds=((0.05, 0.4), (5.0, 10.0)), resamples=50)
-    in_a = HAND.location < 2
-    rows = score_table(HAND.only(in_a), {"mlp-2d": HAND_SCORES[in_a]}, ["a", "b"], config)
+    in_a = HAND.waypoint < 2
+    rows = score_table(HAND[in_a], {"mlp-2d": HAND_SCORES[in_a]}, ["a", "b"], config)
     rows = rows.set_index(["method", "scene"]).loc["mlp-2d"]
     assert rows.loc["b", "n_locations"] == 0 and np.isnan(rows.loc["b", "regret_5m_10deg"])
     assert rows.loc["all", "raw_5m_10deg"] == rows.loc["a", "raw_5m_10deg"] == 1 / 2

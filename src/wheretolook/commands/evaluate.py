@@ -142,7 +142,7 @@ def evaluate_methods(
             says that they are not logged.
     """
     from wheretolook.evaluation.results import best_in_words, log_evaluation, results_folder
-    from wheretolook.evaluation.run import compare_methods
+    from wheretolook.evaluation.scoring import compare_methods
 
     title = f"Localization score on {dataset.name}" + (f", {config.split} scenes" if config.split != "test" else "")
     folder = results_folder(dataset, config)

@@ -36,16 +36,17 @@ from wheretolook.dataset.layout import Dataset, SceneFolder
 from wheretolook.dataset.viewpoint_table import FIRST
 from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.evaluation.ranking import (
-    CandidateSet,
-    RankedViews,
     TopN,
     choose_at_random,
     choose_best,
     choose_oracle,
+    first_of_locations,
+    n_locations,
     rank_views,
 )
 from wheretolook.evaluation.statistics import ClusterBootstrap, divide, expected_calibration_error, scale_probability
 from wheretolook.geometry.poses import Float
+from wheretolook.geometry.views import Views
 from wheretolook.scorers.random import RandomScorer
 from wheretolook.scorers.registry import is_probability
 from wheretolook.tracking.runs import (
@@ -166,7 +167,7 @@ def signed_points(value: float) -> str:
     return f"{round(100 * value, 1) + 0.0:+.1f}"  # + 0.0 makes -0.0 positive
 
 
-def choose(views: RankedViews, scores: Mapping[str, Float], top_n: Sequence[int]) -> Choices:
+def choose(views: Views, scores: Mapping[str, Float], top_n: Sequence[int]) -> Choices:
     """Choose N views of every location by each method's scores (B,), and by the oracle."""
     choices: dict[tuple[str, int], TopN] = {}
     for method, values in scores.items():
@@ -195,7 +196,7 @@ def reference_method(methods: Iterable[str], name: str) -> str:
 
 
 def score_table(
-    views: RankedViews,
+    views: Views,
     scores: Mapping[str, Float],
     scenes: Sequence[str],
     config: EvaluateConfig,
@@ -223,15 +224,16 @@ def score_table(
     Raises:
         ConfigError: the reference is none of the methods.
     """
-    pools = [(ALL, np.ones(views.n_locations, dtype=bool))]
-    pools += [(name, views.location_scene == number) for number, name in enumerate(scenes)]
+    places = first_of_locations(views)
+    pools = [(ALL, np.ones(len(places), dtype=bool))]
+    pools += [(name, places.scene == number) for number, name in enumerate(scenes)]
     reference = reference_method(scores, config.reference)
     choices = choose(views, scores, config.top_n) if choices is None else choices
     rows: list[dict[str, object]] = []
     for name, locations in pools:
-        inside = locations[views.location]
-        strata = views.location_scene[locations]
-        bootstrap = ClusterBootstrap(views.location_block[locations], config.resamples, config.seed, strata)
+        inside = locations[views.waypoint]
+        strata = places.scene[locations]
+        bootstrap = ClusterBootstrap(places.block[locations], config.resamples, config.seed, strata)
         good = views.good[inside, 0]
         metrics = {}
         for method, values in scores.items():
@@ -333,7 +335,7 @@ _OF_FIRST_THRESHOLD = ("regret_low", "regret_high", "difference", "difference_lo
 class ScoredSet:
     """Scores, choices and score table of one candidate set by one occlusion model."""
 
-    candidates: CandidateSet
+    views: Views
     scores: Mapping[str, Float]  # (B,) by method
     choices: Choices
     table: pd.DataFrame  # with columns `occlusion` and `candidates`
@@ -346,7 +348,7 @@ class Evaluation:
 
     scenes: Sequence[SceneFolder]
     weights: Mapping[Path, str]  # files of weights, and the method that each serves
-    views: RankedViews  # all labelled views
+    views: Views  # all labelled views
     scored: Sequence[ScoredSet]  # for each occlusion model and candidate set
     table: pd.DataFrame  # their score tables, one below the other
     calibration: pd.DataFrame  # reliability curves of learned methods, see `calibration_rows`; empty without any
@@ -437,17 +439,17 @@ def location_table(scored: ScoredSet, method: str, n: int, config: EvaluateConfi
     (whether one is; both are expectations for random choice), and best_score, the score of the first choice; NaN for
     random choice and the oracle.
     """
-    views = scored.candidates.views
+    places = first_of_locations(scored.views)
     top = scored.choices[method, n]
-    names = [scored.scenes[number].name for number in views.location_scene]
-    table = pd.DataFrame({"scene": names, "location_id": scored.candidates.location_id, "top_n": n})
+    names = [scored.scenes[number].name for number in places.scene]
+    table = pd.DataFrame({"scene": names, "location_id": places.location_id, "top_n": n})
     table["chosen"] = top.chosen.astype(np.int64)
     for index, key in enumerate(map(threshold_key, config.thresholds)):
         table[f"good_{key}"] = top.good[:, index]
         table[f"any_{key}"] = top.any_good[:, index]
-    best = np.full(views.n_locations, np.nan)
+    best = np.full(len(places), np.nan)
     if method in scored.scores and not is_random(method):
-        np.fmax.at(best, views.location, scored.scores[method])
+        np.fmax.at(best, scored.views.waypoint, scored.scores[method])
     return table.assign(best_score=best)
 
 
@@ -474,7 +476,7 @@ def log_evaluation(
     if logged_last(tracking, "evaluate", dataset.name, mark, SCORES_CSV) is not None:
         return
     best, metrics = best_of(evaluation.table)
-    metrics |= {"n_locations": views.n_locations, "n_views": len(views.good), "positives": views.good[:, 0].mean()}
+    metrics |= {"n_locations": n_locations(views), "n_views": len(views), "positives": views.good[:, 0].mean()}
     tags = {"dataset": dataset.name, FINGERPRINT_TAG: mark, **best}
     with temporary_folder() as folder, start_run(tracking, ALL_METHODS, "evaluate", params, tags=tags) as (client, run):
         log(client, run, metrics=metrics)

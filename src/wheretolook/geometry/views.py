@@ -86,6 +86,15 @@ class Views:
     n_too_far: Column = None
     n_too_oblique: Column = None
     n_repeated: Column = None
+    # (V,) of labelled views: number of the scene, ids of location and viewpoint, and block of neighbouring locations
+    scene: Column = None
+    location_id: Column = None
+    viewpoint_id: Column = None
+    block: Column = None
+    good: Column = None  # (V, T) whether the view localizes within each of T thresholds
+    direction_id: Column = None  # (V,) row of the direction in a lattice, -1 where there is no view
+    pixels: Column = None  # V arrays (K, 2) of the landmarks in view
+    images: Column = None  # (V, H, W, 3) uint8
 
     def __len__(self) -> int:
         return len(self.cam_from_world)

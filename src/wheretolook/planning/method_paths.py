@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -12,9 +11,10 @@ from numpy.typing import ArrayLike
 from wheretolook.dataset.environment import Environment
 from wheretolook.dataset.layout import Dataset
 from wheretolook.geometry.poses import poses_looking_along, transform
+from wheretolook.geometry.views import Views
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.planning.config import FORWARD, PlanConfig
-from wheretolook.planning.routes import PathView, PlannedPath
+from wheretolook.planning.routes import PlannedPath
 from wheretolook.planning.rrt import check_ends, plan_path
 from wheretolook.planning.scene_map import check_methods, planner_map, scene_scorer
 from wheretolook.planning.stops import check_stopping, stops_along, within_pitch
@@ -68,41 +68,22 @@ def plan_by_methods(
             path = replace(path, scores=scorer.score(poses_looking_along(path.positions, path.axes)))
             if stopping and (is_probability(scorer.name) or number == len(methods)):
                 axes = within_pitch(views.directions, config.planner)
-                along = (path.positions, path.axes, axes, config.stops, config.planner)
-                path = replace(path, stops=stops_along(scorer, *along, progress="stops"))
+                stops = stops_along(
+                    scorer, path.positions, path.axes, axes, config.stops, config.planner, progress="stops"
+                )
+                path = replace(path, stops=stops)
         paths.pop(name, None)  # a method named twice comes where it was named last
         paths[name] = path
     return paths
 
 
-def path_views(
-    path: PlannedPath, localization_map: LocalizationMap, renderer: Renderer | None = None
-) -> list[PathView]:
-    """Return the views along a path, with the landmarks in view, and the image if there is a renderer.
-
-    The further looks of a stop follow the path's view there.
-    """
+def path_views(path: PlannedPath, localization_map: LocalizationMap, renderer: Renderer | None = None) -> Views:
+    """Return `PlannedPath.views` with the camera, the pixels of the landmarks in view, and images if there is a renderer."""
+    views = path.views
     camera = localization_map.camera
-    rows, looks = path.looks
-    axes = path.all_axes
-    scores = path.all_scores
-    cam_from_world = poses_looking_along(path.positions[rows], axes)
-    in_view = localization_map.landmarks_in_view(cam_from_world)
-    images: Any = [None] * len(rows) if renderer is None else renderer.render(camera, cam_from_world).rgb
-    n_looks = np.bincount(rows)
-    joint = np.where(n_looks > 1, path.scores_with_stops, np.nan)
     points = localization_map.landmarks.points
-    return [
-        PathView(
-            position=path.positions[row],
-            axis=axes[number],
-            score=float(scores[number]),
-            pixels=camera.project(transform(cam_from_world[number], points[in_view[number]])),
-            size_px=(camera.width, camera.height),
-            rgb=images[number],
-            look=int(looks[number]),
-            n_looks=int(n_looks[row]),
-            together=float(joint[row]),
-        )
-        for number, row in enumerate(rows.tolist())
-    ]
+    pixels = []
+    for pose, rows in zip(views.cam_from_world, localization_map.landmarks_in_view(views.cam_from_world), strict=True):
+        pixels.append(camera.project(transform(pose, points[rows])))
+    images = None if renderer is None else renderer.render(camera, views.cam_from_world).rgb
+    return replace(views, camera=camera, pixels=tuple(pixels), images=images)

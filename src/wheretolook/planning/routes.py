@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from wheretolook.geometry.camera_turns import pan_tilt_angles
 from wheretolook.geometry.lattices import axes_of_angles
-from wheretolook.geometry.poses import Float
+from wheretolook.geometry.poses import Float, poses_looking_along
+from wheretolook.geometry.views import Views
 from wheretolook.planning.config import PathConfig
 from wheretolook.planning.view_sequence import TurnLimit, best_sequence, between, lengths_along
 from wheretolook.planning.viewpoint_map import ViewpointMap
@@ -77,31 +78,28 @@ class PlannedPath:
         return turning_deg(self.axes) + sum(stop.turn_deg for stop in self.stops)
 
     @property
-    def n_looks(self) -> int:
-        """Views of the path and further looks at its stops."""
-        return len(self.positions) + sum(len(stop.axes) for stop in self.stops)
+    def views(self) -> Views:
+        """All L views in their order: those of the path, each followed by the further looks of a stop.
 
-    @property
-    def looks(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Row in the path (L,) and number at that position (L,) of all looks in their order.
-
-        The path's own view is 1, further looks of a stop count from 2. `all_axes` and `all_scores` are in this order.
+        `waypoint` is the row in the path, `rank` the number at that position, 1 for the path's own view; `score` is that
+        of a view on its own, `set_score` the joint one of all views there. `all_axes` is in this order.
         """
         counts = np.ones(len(self.positions), dtype=np.int64)
         for stop in self.stops:
             counts[stop.place] += len(stop.axes)
-        places = np.repeat(np.arange(len(counts)), counts)
-        return places, np.arange(len(places)) - np.repeat(np.cumsum(counts) - counts, counts) + 1
+        waypoint = np.repeat(np.arange(len(counts)), counts)
+        return Views(
+            poses_looking_along(self.positions[waypoint], self.all_axes),
+            waypoint=waypoint,
+            rank=np.arange(len(waypoint)) - np.repeat(np.cumsum(counts) - counts, counts) + 1,
+            score=self._with_further(self.scores, [stop.scores for stop in self.stops]),
+            set_score=self.scores_with_stops[waypoint],
+        )
 
     @property
     def all_axes(self) -> Float:
-        """Unit axes (L, 3) of all looks."""
+        """Unit axes (L, 3) of all views."""
         return self._with_further(self.axes, [stop.axes for stop in self.stops])
-
-    @property
-    def all_scores(self) -> Float:
-        """Single-view scores (L,) of all looks."""
-        return self._with_further(self.scores, [stop.scores for stop in self.stops])
 
     def _with_further(self, values: Float, further: list[Float]) -> Float:
         """Merge values (W, ...) of the path's views and of each stop's further looks; (L, ...)."""
@@ -116,33 +114,6 @@ class PlannedPath:
         scores = self.scores.copy()
         scores[[stop.place for stop in self.stops]] = [stop.together for stop in self.stops]
         return scores
-
-
-@dataclass(frozen=True, eq=False)
-class PathView:
-    """One view along a path.
-
-    Attributes:
-        position: (3,) m, world.
-        axis: (3,) unit optical axis.
-        score: one of `PlannedPath.scores`, NaN if unknown.
-        pixels: (K, 2) of the landmarks in view.
-        size_px: width and height of the image.
-        rgb: (H, W, 3); None if the scene cannot be rendered.
-        look: number at its position: 1 for the path's own view, more for further looks at a stop.
-        n_looks: number of looks at its position.
-        together: joint score of all looks at a stop; NaN elsewhere.
-    """
-
-    position: Float
-    axis: Float
-    score: float
-    pixels: Float
-    size_px: tuple[int, int]
-    rgb: NDArray[np.uint8] | None
-    look: int = 1
-    n_looks: int = 1
-    together: float = math.nan
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,6 +12,7 @@ from tqdm.auto import tqdm
 
 from wheretolook.geometry.camera_turns import angles_to_axis_deg
 from wheretolook.geometry.poses import Float, poses_looking_along
+from wheretolook.geometry.views import Views
 from wheretolook.looks.selection import (
     CANDIDATES,
     SEPARATION_DEG,
@@ -33,17 +34,6 @@ COMPASS = np.stack([np.cos(np.arange(8) * np.pi / 4), np.sin(np.arange(8) * np.p
 """Steps (8, 2) in the plane that touches the sphere at the current axis."""
 
 
-@dataclass(frozen=True, eq=False)
-class RefinedViews:
-    """Result of a local search: unit axes (B, 3) in the world, their scores (B,), which are at least the scores (B,) at the
-    start, and the number of scored views."""
-
-    axes: Float
-    scores: Float
-    start_scores: Float
-    n_scored: int
-
-
 def refine_directions(
     scorer: Scorer,
     locations: ArrayLike,
@@ -51,7 +41,7 @@ def refine_directions(
     max_angle_deg: float = 10.0,
     first_step_deg: float = 4.0,
     last_step_deg: float = 0.25,
-) -> RefinedViews:
+) -> Views:
     """Improve axes by a pattern search on the sphere (Hooke and Jeeves 1961; compass search, Kolda et al. 2003).
 
     Eight axes one step away from the current one are scored; the best of them replaces it if it scores higher,
@@ -60,23 +50,20 @@ def refine_directions(
 
     The search begins at locations (B, 3) m with axes (B, 3) of any length, such as the best of a lattice. The default
     `max_angle_deg` from there exceeds the distance of neighbours on a lattice of 500 directions; about half that
-    distance works well as the first step. Raises ValueError if locations or axes are not finite, have no length or
+    distance works well as the first step. Returns views with their scores, none below that of its start. Raises ValueError if locations or axes are not finite, have no length or
     differ in number, or an angle is not positive.
     """
     if not (max_angle_deg > 0 and first_step_deg > 0 and last_step_deg > 0):
         raise ValueError("angles must be positive")
     at, start = (np.asarray(values, dtype=np.float64).reshape(-1, 3) for values in (locations, axes))
-    start_scores = scorer.score(poses_looking_along(at, start))  # raises on what is not finite
+    scores = scorer.score(poses_looking_along(at, start))  # raises on what is not finite
     start = start / np.linalg.norm(start, axis=1, keepdims=True)
     current = start.copy()
     step_deg = np.full(len(start), float(min(first_step_deg, max_angle_deg)))
-    scores = start_scores.copy()
-    n_scored = len(start)
     while len(active := np.flatnonzero(step_deg >= last_step_deg)):
         candidates = _neighbour_directions(current[active], step_deg[active])
         candidates = _within(candidates, start[active, None], max_angle_deg)
         values = scorer.score(poses_looking_along(np.repeat(at[active], 8, axis=0), candidates.reshape(-1, 3)))
-        n_scored += len(values)
         values = values.reshape(-1, 8)
         best = values.argmax(axis=1)
         value = values[np.arange(len(active)), best]
@@ -85,7 +72,7 @@ def refine_directions(
         current[moved] = candidates[better, best[better]]
         scores[moved] = value[better]
         step_deg[active[~better]] /= 2
-    return RefinedViews(current, scores, start_scores, n_scored)
+    return Views(poses_looking_along(at, current), method=scorer.name, score=scores)
 
 
 def _neighbour_directions(axes: Float, step_deg: Float) -> Float:

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from wheretolook.commands.demo import Demo
     from wheretolook.evaluation.config import EvaluateConfig
     from wheretolook.geometry.poses import Float
-    from wheretolook.planning.routes import PathView
+    from wheretolook.geometry.views import Views
     from wheretolook.scorers.base import Scorer
     from wheretolook.tracking.store import TrackingConfig
 
@@ -73,7 +73,7 @@ def report_scores(folder: Path, table: pd.DataFrame, calibration: pd.DataFrame, 
     return text
 
 
-def draw_path(views: dict[str, list[PathView]], landmarks: Float, title: str, folder: Path, film: str) -> list[str]:
+def draw_path(views: dict[str, Views], landmarks: Float, title: str, folder: Path, film: str) -> list[str]:
     """Draw the last of several methods' planned paths, and all side by side; return the names of the files.
 
     Args:

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from wheretolook.dataset.layout import Dataset
 from wheretolook.figures.style import BLUE, GREY, RC, VERMILION, frame, new_figure, scene_label
-from wheretolook.geometry.poses import Float
-from wheretolook.planning.routes import PathView
+from wheretolook.geometry.poses import Float, poses_looking_along
+from wheretolook.geometry.views import Views
 from wheretolook.planning.view_sequence import lengths_along
 from wheretolook.utils.errors import MissingRunError
 from wheretolook.utils.texts import markdown_table
@@ -72,8 +72,8 @@ def _draw_scene(figure: Any, table: pd.DataFrame, landmarks: Float, pictures: Pi
         axes = figure.add_subplot(grid[0, column])
         shown = np.unique(np.linspace(0, len(rows) - 1, N_SHOWN).round().astype(int)).tolist()
         at = rows[POSITION].to_numpy()
-        of_rows = zip(at, rows[AXIS].to_numpy(), strict=True)
-        views = [PathView(place, axis, np.nan, np.empty((0, 2)), (0, 0), None) for place, axis in of_rows]
+        one = np.ones(len(rows), dtype=np.int64)
+        views = Views(poses_looking_along(at, rows[AXIS].to_numpy()), waypoint=np.arange(len(rows)), rank=one)
         draw_path(axes, views, landmarks, shown=shown)
         axes.set(xlabel=f"x ({unit})", ylabel=f"y ({unit})")
         axes.set_title(f"{method_style(str(method)).label}\n{_summary(rows)}", fontsize=10)

@@ -112,7 +112,7 @@ def plan_on(
         table = pd.DataFrame({"method": method, "waypoint": np.arange(len(row))})
         table[POSITION] = path.positions / unit_m
         table[AXIS] = path.axes
-        table["visible"] = [len(view.pixels) for view in path_views(path, localization_map)]
+        table["visible"] = [len(pixels) for pixels in path_views(path, localization_map).pixels]
         table["probability"] = scorer.score(poses_looking_along(path.positions, path.axes))
         table["image"] = np.array(source.names)[row]
         table["distance"] = distance / unit_m

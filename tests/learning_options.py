@@ -3,7 +3,7 @@
 from dataclasses import fields, replace
 
 from synthetic_dataset import CAMERA
-from wheretolook.scorers.mlp.config import MlpConfig
+from wheretolook.scorers.mlp import MlpConfig
 from wheretolook.scorers.train_config import TrainConfig
 from wheretolook.training.trained_network import TrainedNetwork
 

@@ -28,9 +28,9 @@ from wheretolook.scorers.registry import make_scorer, scorers
 from wheretolook.space.mapped_space import MappedSpace
 from wheretolook.utils import devices as memory
 from wheretolook.utils.errors import ConfigError, SceneError
+from wheretolook.visibility.counting import SurveyOptions, survey
 from wheretolook.visibility.hidden_points import HiddenPointRemoval
 from wheretolook.visibility.occlusion import NoOcclusion
-from wheretolook.visibility.survey import SurveyOptions, survey
 
 pytestmark = pytest.mark.filterwarnings("ignore::wheretolook.utils.errors.OutOfRangeWarning")
 

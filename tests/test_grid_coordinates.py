@@ -40,10 +40,9 @@ from wheretolook.scenes.loading import load_mesh, save_glb
 from wheretolook.scorers.registry import make_scorer, scorers
 from wheretolook.space.free_space import FreeSpace, TsdfSpace
 from wheretolook.utils.errors import OutOfRangeWarning
+from wheretolook.visibility.counting import survey
 from wheretolook.visibility.hidden_points import HiddenPointRemoval
-from wheretolook.visibility.occlusion import MeshOcclusion
-from wheretolook.visibility.survey import survey
-from wheretolook.visibility.tsdf import TsdfOcclusion
+from wheretolook.visibility.occlusion import MeshOcclusion, TsdfOcclusion
 
 SHIFT = np.array([4e6, 5e6, 300.0])  # as of a place in Europe in UTM, and its height
 ROOM_POSES = poses_looking_along(

@@ -311,8 +311,8 @@ def full_name(command: Any, name: str) -> str:
     for group, prefix in command.GROUPS.items():
         if name.startswith(f"{group}."):
             name = prefix + name.removeprefix(f"{group}.")
-    short: str = command.SHORT.get(name, name)
-    return short
+    full: str = command.SHORT.get(name) or command.SHORT.get(name.replace("_", "-"), name)
+    return full
 
 
 def option_of(name: str, known: Iterable[str]) -> str | None:

@@ -34,8 +34,8 @@ from wheretolook.geometry.poses import poses_looking_along, rotation_looking_alo
 from wheretolook.localization.config import LocalizerConfig
 from wheretolook.localization.localizer import Localizer
 from wheretolook.utils.warp import start_warp
+from wheretolook.visibility.counting import SurveyOptions, survey
 from wheretolook.visibility.occlusion import DevicePoints, NoOcclusion
-from wheretolook.visibility.survey import SurveyOptions, survey
 
 LEDGER = Path(__file__).with_name("ledger.csv")
 KEYPOINTS = 2000

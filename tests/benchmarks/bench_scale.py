@@ -31,8 +31,8 @@ from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.scorers.weights import load_scorer
 from wheretolook.utils.warp import start_warp
+from wheretolook.visibility.counting import SurveyOptions, survey
 from wheretolook.visibility.occlusion import DevicePoints, NoOcclusion, StoredOcclusion
-from wheretolook.visibility.survey import SurveyOptions, survey
 
 IN_ROOM = 2_500  # landmarks
 PITCH_M = 12.0  # between rooms

@@ -42,9 +42,8 @@ from wheretolook.scenes.loading import load_mesh
 from wheretolook.space.free_space import FreeSpace
 from wheretolook.utils.processes import cores
 from wheretolook.utils.warp import start_warp
-from wheretolook.visibility.counting import FrustumCounter
+from wheretolook.visibility.counting import FrustumCounter, SurveyOptions, survey
 from wheretolook.visibility.occlusion import DevicePoints, MeshOcclusion, NoOcclusion
-from wheretolook.visibility.survey import SurveyOptions, survey
 from wheretolook_rooms.generator import generate_apartment
 
 CAMERA = PinholeCamera()

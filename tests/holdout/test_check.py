@@ -21,7 +21,7 @@ from wheretolook.holdout.report import CheckReport
 from wheretolook.holdout.scores import whole_map
 from wheretolook.mapping.colmap_model import model_arrays, observation_matrix, read_model
 from wheretolook.mapping.config import FrameOptions
-from wheretolook.scorers.adapted.network import AdaptedNetwork
+from wheretolook.scorers.adapted.score import AdaptedNetwork
 from wheretolook.scorers.set.network import SetNetwork
 from wheretolook.scorers.set.score import for_map
 from wheretolook.training.trained_network import TrainedNetwork

@@ -11,8 +11,8 @@ from twins.visibility import count_pixels_plain
 from wheretolook.geometry.camera import ColmapCamera, PinholeCamera
 from wheretolook.geometry.poses import rotation_looking_along
 from wheretolook.utils.errors import ConfigError
+from wheretolook.visibility.counting import SurveyOptions, survey
 from wheretolook.visibility.occlusion import DevicePoints, NoOcclusion
-from wheretolook.visibility.survey import SurveyOptions, survey
 from wheretolook_paper.visibility.pixel_counter import PixelCounter
 
 

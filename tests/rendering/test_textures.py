@@ -3,7 +3,7 @@
 import numpy as np
 
 from box_scenes import random_texture, random_triangles
-from wheretolook.rendering.textures import build_pyramids, texel_gradients
+from wheretolook.rendering.warp_renderer import build_pyramids, texel_gradients
 
 
 def level_of(pyramids, texture, level):

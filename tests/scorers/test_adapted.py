@@ -13,7 +13,7 @@ from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.scorers.adapted.calibration import LocalizedViews, adapt, calibrate, log_losses, splits
-from wheretolook.scorers.adapted.network import AdaptedNetwork
+from wheretolook.scorers.adapted.score import AdaptedNetwork
 from wheretolook.scorers.set.network import SetNetwork
 from wheretolook.scorers.weights import load_scorer
 from wheretolook.training.trained_network import TrainedNetwork

@@ -13,13 +13,15 @@ from wheretolook.dataset.viewpoint_table import LOCALIZED, is_good, poses
 from wheretolook.geometry import pose_information as information
 from wheretolook.inputs.landmark_features import ATTRIBUTES, LandmarkDescriber, ViewLandmarks
 from wheretolook.inputs.statistics import FeatureStatistics
-from wheretolook.scorers.matchability.network import MatchabilityNetwork, bearing_numbers, expected_parts
-from wheretolook.scorers.set.config import SetConfig
+from wheretolook.scorers.set import SetConfig
 from wheretolook.scorers.set.learn import of_size
 from wheretolook.scorers.set.network import (
     EXPECTED,
+    MatchabilityNetwork,
     SetNetwork,
+    bearing_numbers,
     expected_cells,
+    expected_parts,
     expected_statistics,
     information_matrices,
 )

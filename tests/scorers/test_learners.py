@@ -17,10 +17,9 @@ from wheretolook.dataset.viewpoint_table import poses
 from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.inputs.landmark_features import LandmarkDescriber
 from wheretolook.inputs.localization_map import LocalizationMap
-from wheretolook.scorers.matchability.config import MatchabilityConfig
-from wheretolook.scorers.matchability.network import MatchabilityNetwork
 from wheretolook.scorers.registry import learned, make_scorer, scorers
-from wheretolook.scorers.set.config import SetConfig
+from wheretolook.scorers.set import MatchabilityConfig, SetConfig
+from wheretolook.scorers.set.network import MatchabilityNetwork
 from wheretolook.scorers.weights import load_scorer
 from wheretolook.tracking.store import TrackingConfig, client
 from wheretolook.training.trained_network import TrainedNetwork

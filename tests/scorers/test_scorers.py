@@ -15,13 +15,12 @@ from wheretolook.inputs.channels import ALL_CHANNELS, CHANNELS
 from wheretolook.inputs.landmark_features import ATTRIBUTES, LandmarkDescriber
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.inputs.statistics import FeatureStatistics
-from wheretolook.scorers.adapted.network import AdaptedNetwork
+from wheretolook.scorers.adapted.score import AdaptedNetwork
 from wheretolook.scorers.base import Scorer
 from wheretolook.scorers.bins import BinsScorer
-from wheretolook.scorers.matchability.network import MatchabilityNetwork
 from wheretolook.scorers.mlp.network import NetworkSpec, ViewpointNetwork
 from wheretolook.scorers.registry import make_scorer, scorers
-from wheretolook.scorers.set.network import SetNetwork
+from wheretolook.scorers.set.network import MatchabilityNetwork, SetNetwork
 from wheretolook.scorers.visible import VisibleScorer
 from wheretolook.scorers.weights import load_scorer
 from wheretolook.utils.errors import CameraError, ConfigError, PoseError, WeightsError

@@ -13,8 +13,7 @@ from wheretolook.dataset.layout import Dataset
 from wheretolook.dataset.viewpoint_files import read_table, write_table
 from wheretolook.dataset.viewpoint_table import LOCALIZED, is_good
 from wheretolook.evaluation.config import EvaluateConfig
-from wheretolook.scorers.matchability.config import MatchabilityConfig
-from wheretolook.scorers.set.config import SetConfig
+from wheretolook.scorers.set import MatchabilityConfig, SetConfig
 from wheretolook.tracking.store import TrackingConfig
 from wheretolook.training.weights import read_weights
 from wheretolook_paper.scorers.trees import TreesConfig

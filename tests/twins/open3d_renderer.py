@@ -8,8 +8,14 @@ from numpy.typing import NDArray
 from wheretolook.geometry.camera import ColmapCamera
 from wheretolook.geometry.poses import check_poses
 from wheretolook.geometry.similarity import poses_from
-from wheretolook.rendering.textures import MAX_ANISOTROPY, build_pyramids, texel_gradients
-from wheretolook.rendering.warp_renderer import Rendering, camera_rays, render_distorted
+from wheretolook.rendering.kernels import MAX_ANISOTROPY
+from wheretolook.rendering.warp_renderer import (
+    Rendering,
+    build_pyramids,
+    camera_rays,
+    render_distorted,
+    texel_gradients,
+)
 
 Float = NDArray[np.floating[Any]]
 

@@ -14,7 +14,7 @@ import torch
 from selection.room import WEIGHTS, write_room
 from synthetic_dataset import make_dataset
 from wheretolook.dataset.layout import Dataset
-from wheretolook.scorers.adapted.network import AdaptedNetwork
+from wheretolook.scorers.adapted.score import AdaptedNetwork
 from wheretolook.scorers.set.network import SetNetwork
 from wheretolook.training.provenance import training_fingerprint
 from wheretolook.training.trained_network import TrainedNetwork

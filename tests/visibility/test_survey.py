@@ -14,10 +14,9 @@ from wheretolook.geometry.poses import rotation_looking_along
 from wheretolook.rendering.raycasting import MeshRaycaster
 from wheretolook.utils.errors import ConfigError, MapError, SceneError
 from wheretolook.utils.warp import start_warp
-from wheretolook.visibility.counting import FrustumCounter
+from wheretolook.visibility.counting import FrustumCounter, SurveyOptions, survey
 from wheretolook.visibility.counting_kernel import best_kernel
 from wheretolook.visibility.occlusion import MeshOcclusion, NoOcclusion, OcclusionModel
-from wheretolook.visibility.survey import SurveyOptions, survey
 
 
 def boxes(*quads):

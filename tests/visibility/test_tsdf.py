@@ -8,8 +8,7 @@ from mask_agreement import MaskAgreement
 from wheretolook.geometry.tsdf import DepthImage, TsdfVolume
 from wheretolook.rendering.raycasting import MeshRaycaster
 from wheretolook.utils.errors import SceneError
-from wheretolook.visibility.occlusion import MeshOcclusion
-from wheretolook.visibility.tsdf import TsdfOcclusion
+from wheretolook.visibility.occlusion import MeshOcclusion, TsdfOcclusion
 
 
 def lines_of_sight(mesh, seed):

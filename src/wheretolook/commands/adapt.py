@@ -390,7 +390,7 @@ def _counts(views: LocalizedViews) -> dict[str, object]:
 def _save(target: _Target, whole: LocalizationMap, adapted: Adapted, views: LocalizedViews, gain: Gain) -> None:
     import torch
 
-    from wheretolook.scorers.adapted.network import AdaptedNetwork
+    from wheretolook.scorers.adapted.score import AdaptedNetwork
     from wheretolook.scorers.set.network import SetNetwork
     from wheretolook.scorers.set.score import for_map
     from wheretolook.training.trained_network import TrainedNetwork

@@ -18,8 +18,8 @@ from wheretolook.geometry.poses import Float, camera_centers, poses_looking_alon
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.utils.devices import fitting
 from wheretolook.utils.errors import ConfigError, SceneError
+from wheretolook.visibility.counting import Survey, SurveyOptions, survey
 from wheretolook.visibility.occlusion import OcclusionModel, StoredOcclusion
-from wheretolook.visibility.survey import Survey, SurveyOptions, survey
 
 NEAR_M = 0.2  # standard deviation along each axis of a location near a mapping image
 NEAR_DEG = 40.0  # largest angle between its directions and that of the image

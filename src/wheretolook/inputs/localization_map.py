@@ -19,8 +19,7 @@ from wheretolook.mapping.map_frame import IDENTITY, MapFrame, has_photographs, w
 from wheretolook.mapping.mapped_images import MappedImages, open_colmap
 from wheretolook.utils.errors import check_positive
 from wheretolook.visibility import frustum
-from wheretolook.visibility.counting import in_view_by_table
-from wheretolook.visibility.frustum import LandmarkSets, PosedViews, landmarks_in_view
+from wheretolook.visibility.frustum import LandmarkSets, PosedViews, in_view_by_table, landmarks_in_view
 from wheretolook.visibility.occlusion import NoOcclusion, OcclusionModel
 
 if TYPE_CHECKING:

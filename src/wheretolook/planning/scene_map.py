@@ -25,7 +25,7 @@ from wheretolook.scorers.base import Scorer
 from wheretolook.scorers.registry import FALLBACK, is_probability, make_scorer, methods_named, scorers
 from wheretolook.scorers.weights import load_scorer
 from wheretolook.utils.errors import ConfigError, SceneError, check_range
-from wheretolook.visibility.survey import SurveyOptions, survey
+from wheretolook.visibility.counting import SurveyOptions, survey
 
 Text = str | None  # text of progress bars; None shows none
 

@@ -1,16 +1,15 @@
 """Warp kernels that render by rays and by rasterization."""
 
+# mypy: ignore-errors
+# Warp's kernel language is not Python's type system.
+
 from __future__ import annotations
 
 import warp as wp
 
-from wheretolook.rendering.textures import MAX_ANISOTROPY
-
-# mypy: ignore-errors
-# Warp's kernel language is not Python's type system.
-
-
-_MAX_TAPS = wp.constant(MAX_ANISOTROPY)
+# Up to this ratio of a pixel footprint's axes, several samples along the long axis replace a coarser mip level. 8 keeps
+# floors and walls sharp that are seen at a slant.
+MAX_ANISOTROPY = wp.constant(8)
 TILE = wp.constant(8)
 
 
@@ -99,8 +98,8 @@ def shade(
     root = wp.sqrt((p - r) * (p - r) + 4.0 * q * q)
     major = wp.sqrt(0.5 * (p + r + root))
     minor = wp.abs(j00 * j11 - j01 * j10) / wp.max(major, 1.0e-12)
-    width = wp.max(wp.max(minor, major / wp.float32(_MAX_TAPS)), 1.0)
-    n_taps = wp.clamp(wp.int32(wp.floor(major / width + 0.5)), 1, _MAX_TAPS)
+    width = wp.max(wp.max(minor, major / wp.float32(MAX_ANISOTROPY)), 1.0)
+    n_taps = wp.clamp(wp.int32(wp.floor(major / width + 0.5)), 1, MAX_ANISOTROPY)
     axis = wp.vec2(0.5 * (p - r + root), q)
     if p < r:
         axis = wp.vec2(q, 0.5 * (r - p + root))
@@ -166,10 +165,6 @@ def trace_kernel(
         color = shade(appearance, hit.face, weights, depth, hit.normal, direction, ray_from_pixel[b])
     rgb[b, row, column] = color
     depth_m[b, row, column] = depth
-
-
-# mypy: ignore-errors
-# Warp's kernel language is not Python's type system.
 
 
 # Triangles are widened by this many pixels, so that rounding opens no gap between neighbours.

@@ -3,21 +3,96 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, no_type_check
 
 import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
 from wheretolook.geometry.mesh import TexturedMesh
-from wheretolook.rendering import ray_kernels
-from wheretolook.rendering.ray_kernels import cast_kernel, clear_kernel, distance_kernel, unoccluded_kernel
 from wheretolook.utils.devices import in_threads
 from wheretolook.utils.processes import cores
 from wheretolook.utils.warp import start_warp, vec3_array
 
+wp.set_module_options({"enable_backward": False})
+
 BLOCK_DIM = 64  # threads of a block on a GPU: rays of a block wait for its longest
 BLOCK_RAYS = 1 << 28  # traced at a time by `occluded`, to bound the memory on the device
+
+
+@wp.kernel
+@no_type_check
+def unoccluded_kernel(
+    mesh: wp.uint64, origins: wp.array[wp.vec3], points: wp.array[wp.vec3], margin_m: float, clear: wp.array2d[bool]
+):
+    i, j = wp.tid()
+    ray = points[j] - origins[i]
+    distance = wp.length(ray)
+    reach = distance - margin_m
+    blocked = wp.bool(False)
+    if reach > 0.0:
+        blocked = wp.mesh_query_ray_anyhit(mesh, origins[i], ray / distance, reach)
+    clear[i, j] = not blocked
+
+
+@wp.kernel
+@no_type_check
+def cast_kernel(
+    mesh: wp.uint64,
+    origins: wp.array[wp.vec3],
+    directions: wp.array[wp.vec3],
+    distance_m: wp.array[wp.float32],
+    triangle: wp.array[wp.int32],
+    front: wp.array[wp.bool],
+):
+    i = wp.tid()
+    hit = wp.mesh_query_ray(mesh, origins[i], wp.normalize(directions[i]), 1.0e6)
+    if hit.result:
+        distance_m[i] = hit.t
+        triangle[i] = hit.face
+        front[i] = hit.sign > 0.0
+    else:
+        distance_m[i] = wp.inf
+        triangle[i] = -1
+        front[i] = False
+
+
+@wp.kernel
+@no_type_check
+def distance_kernel(mesh: wp.uint64, points: wp.array[wp.vec3], farthest_m: float, distance_m: wp.array[float]):
+    i = wp.tid()
+    nearest = wp.mesh_query_point_no_sign(mesh, points[i], farthest_m)
+    distance_m[i] = wp.inf
+    if nearest.result:
+        at = wp.mesh_eval_position(mesh, nearest.face, nearest.u, nearest.v)
+        distance_m[i] = wp.length(at - points[i])
+
+
+@wp.kernel
+@no_type_check
+def clear_kernel(
+    mesh: wp.uint64, starts: wp.array[wp.vec3], ends: wp.array[wp.vec3], clearance_m: float, clear: wp.array[bool]
+):
+    # A ball as large as the distance to the nearest surface is empty, so step by that distance less the clearance.
+    i = wp.tid()
+    start = starts[i]
+    length = wp.length(ends[i] - start)
+    toward = (ends[i] - start) / wp.max(length, 1.0e-9)
+    reach = length + 2.0 * clearance_m  # surfaces beyond this distance do not matter
+    travelled = wp.float32(0.0)
+    result = wp.bool(True)
+    while result and travelled <= length:
+        nearest = wp.mesh_query_point_no_sign(mesh, start + travelled * toward, reach)
+        if not nearest.result:
+            break
+        at = wp.mesh_eval_position(mesh, nearest.face, nearest.u, nearest.v)
+        distance = wp.length(at - start - travelled * toward)
+        if distance < clearance_m:
+            result = False
+        if travelled == length:
+            break
+        travelled = wp.min(travelled + wp.max(distance - clearance_m, 0.1 * clearance_m), length)
+    clear[i] = result
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +112,7 @@ class MeshRaycaster:
 
     def __init__(self, mesh: TexturedMesh, device: str = "cpu") -> None:
         self.device = start_warp(device)
-        wp.load_module(ray_kernels, device=self.device)  # only one thread may do that
+        wp.load_module(__name__, device=self.device)  # only one thread may do that
         self.warp_mesh = warp_mesh(mesh, self.device)
         self.origin = mesh.origin
 

@@ -94,7 +94,7 @@ def network_scorer(scorer: str, network: str, *methods: str) -> Callable[[Locali
     return build
 
 
-MODULES = ("random", "forward", "visible", "bins", "mlp", "matchability", "set", "adapted")
+MODULES = ("random", "forward", "visible", "bins", "mlp", "set", "adapted")
 """Modules of `wheretolook.scorers` whose `METHODS` are the package's own."""
 
 GROUP = "wheretolook.methods"  # entry points of this group are a `Method`, or several, of another package

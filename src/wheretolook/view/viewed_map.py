@@ -238,7 +238,7 @@ def _if_adapted_to(path: Path, landmarks: Landmarks) -> Path | None:
         return None
     from safetensors import SafetensorError, safe_open
 
-    from wheretolook.scorers.adapted.place import MIN_SHARE, share_of_place
+    from wheretolook.scorers.adapted.score import MIN_SHARE, share_of_place
 
     try:
         with safe_open(path, framework="np") as file:

@@ -23,7 +23,7 @@ class OcclusionKind:
 OCCLUSION_MODELS = {
     "mesh": OcclusionKind("wheretolook.visibility.occlusion:MeshOcclusion", "mesh", ("margin_m",)),
     "tsdf": OcclusionKind(
-        "wheretolook.visibility.tsdf:TsdfOcclusion", "depth images", ("margin_m", "voxel_m", "max_depth_m")
+        "wheretolook.visibility.occlusion:TsdfOcclusion", "depth images", ("margin_m", "voxel_m", "max_depth_m")
     ),
     "hidden-points": OcclusionKind(
         "wheretolook.visibility.hidden_points:HiddenPointRemoval", settings=("margin_m", "radius")

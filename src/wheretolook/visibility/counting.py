@@ -2,28 +2,34 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
+from tqdm.auto import tqdm
 
 from wheretolook.geometry.camera import Camera, ColmapCamera, PinholeCamera
-from wheretolook.geometry.poses import Float, split_poses
-from wheretolook.utils.errors import ConfigError
+from wheretolook.geometry.poses import Float
+from wheretolook.utils.devices import fitting, in_threads
+from wheretolook.utils.errors import ConfigError, SceneError
+from wheretolook.utils.processes import cores
 from wheretolook.utils.warp import start_warp
-from wheretolook.visibility import counting_kernel, frustum, frustum_kernel
-from wheretolook.visibility import counting_kernel as kernels
+from wheretolook.visibility import counting_kernel, frustum_kernel
 from wheretolook.visibility.frustum import (
-    LandmarkSets,
-    PosedViews,
+    MIN_DEPTH_M,
+    camera_sees,
     cell_centers,
+    decided,
     frustum_sides,
+    near_radius_m,
     octahedral_directions,
+    sides_rounding,
     tabulate,
 )
+from wheretolook.visibility.occlusion import DevicePoints, OcclusionModel, StoredOcclusion
 
 ROUNDING = 1e-5  # least relative distance of a cell's corners from a plane, since rounding may move landmarks into it
 
@@ -70,14 +76,14 @@ class SphereCells:
             centers, radii = cell_centers(size)
             arrays = [upload(rotations, wp.mat33), upload(centers, wp.vec3), upload(field.depth_rad, wp.float32)]
             inputs = [*arrays, field.size, float(radii.max()) + ROUNDING]
-            wp.launch(kernels.classify_field_kernel, shape, inputs, [classes], device=device)
+            wp.launch(counting_kernel.classify_field_kernel, shape, inputs, [classes], device=device)
         else:
             edge = np.arange(size + 1) / size * 2 - 1
             corners = octahedral_directions(edge[None, :], edge[:, None]).reshape(-1, 3)
             sides = frustum_sides(camera, rotations)
             margin = float(ROUNDING * np.linalg.norm(sides, axis=-1).max(initial=0))
             inputs = [upload(sides, wp.vec3), upload(corners, wp.vec3), size, margin]
-            wp.launch(kernels.classify_pinhole_kernel, shape, inputs, [classes], device=device)
+            wp.launch(counting_kernel.classify_pinhole_kernel, shape, inputs, [classes], device=device)
         return cls(size, *_runs(classes, size))
 
 
@@ -89,11 +95,11 @@ def _runs(classes: Any, size: int) -> tuple[CellRuns, CellRuns]:
     numbers: Any = wp.zeros(2 * n_rows + 1, dtype=wp.int32, device=device)
     none: list[Any] = [wp.empty(0, dtype=dtype, device=device) for dtype in (wp.int32, wp.vec2i)]
     inputs = [classes, classes.shape[0], size]
-    wp.launch(kernels.runs_kernel, shape, [*inputs, False, none[0]], [numbers, none[1]], device=device)
+    wp.launch(counting_kernel.runs_kernel, shape, [*inputs, False, none[0]], [numbers, none[1]], device=device)
     starts: Any = wp.empty_like(numbers)
     wp.utils.array_scan(numbers, starts, inclusive=False)
     cells: Any = wp.empty(int(starts[2 * n_rows :].numpy()[0]), dtype=wp.vec2i, device=device)
-    wp.launch(kernels.runs_kernel, shape, [*inputs, True, starts], [numbers, cells], device=device)
+    wp.launch(counting_kernel.runs_kernel, shape, [*inputs, True, starts], [numbers, cells], device=device)
     return CellRuns(starts[: n_rows + 1], cells), CellRuns(starts[n_rows:], cells)
 
 
@@ -134,10 +140,10 @@ class FrustumCounter:
         self._axes: Any = wp.array(self.rotations, dtype=wp.mat33, device=self.device)
         self._near = 0.0
         if isinstance(camera, PinholeCamera):
-            sides = frustum.frustum_sides(camera, rotations)
+            sides = frustum_sides(camera, rotations)
             self._sides: Any = wp.array(sides, dtype=wp.vec3, device=self.device)
-            self._rounding = frustum.sides_rounding(sides)
-            self._near = frustum.near_radius_m(camera)
+            self._rounding = sides_rounding(sides)
+            self._near = near_radius_m(camera)
         elif self._field is not None:
             self._depth: Any = wp.array(self._field.depth_rad, dtype=wp.float32, device=self.device)
 
@@ -171,7 +177,7 @@ class FrustumCounter:
         """Add what is in view to counts (L, D) of zeros, by landmarks sorted into cells."""
         if self._field is not None:
             return self._count_by_field(landmarks, counts)
-        inputs = [self._sides, landmarks, self._rounding, wp.float64(frustum.MIN_DEPTH_M), self.lanes]
+        inputs = [self._sides, landmarks, self._rounding, wp.float64(MIN_DEPTH_M), self.lanes]
         wp.launch(counting_kernel.count_kernel, (*counts.shape, self.lanes), inputs, [counts], device=self.device)
         return counts
 
@@ -241,7 +247,7 @@ class FrustumCounter:
         assert isinstance(self.camera, ColmapCamera)
         more = np.zeros(counts.shape, dtype=np.int32)
         location, orientation = pairs.T
-        seen = frustum.camera_sees(self.camera, self.rotations, orientation, offsets)
+        seen = camera_sees(self.camera, self.rotations, orientation, offsets)
         np.add.at(more, (location[seen], orientation[seen]), 1)
         wp.copy(counts, wp.array(counts.numpy() + more, dtype=wp.int32, device=self.device))
 
@@ -266,64 +272,6 @@ class ListedViews:
     starts: NDArray[np.int64]  # (V + 1,); view v has `starts[v]` to `starts[v + 1]` of the next two
     entries: Any  # (E,) int32 rows of `Surroundings`, on the lister's device
     image: Any  # (E,) vec2, x / z and y / z in the camera, likewise
-
-
-def in_view_by_table(posed: PosedViews, points: Any, device: str = "cpu") -> LandmarkSets:
-    """What `frustum.landmarks_in_view` gives for a COLMAP camera, by a table of its field of view; on the host.
-
-    The table takes a second to make, and the camera is asked only about landmarks near the border of the view. Points
-    are those of `points_on_device`.
-    """
-    camera = posed.camera
-    assert isinstance(camera, ColmapCamera)
-    wp.load_module(counting_kernel, device=device)
-    field = tabulate(camera)
-    rotations, centers = split_poses(posed.cam_from_world)
-    single = rotations.astype(np.float32)
-    inputs = [
-        wp.array(single, dtype=wp.mat33, device=device),
-        wp.array(centers, dtype=wp.vec3d, device=device),
-        wp.array(np.asarray(posed.location_rows, dtype=np.int32), dtype=wp.int32, device=device),
-        points,
-        *frustum.sets_on_device(posed.unoccluded, device),
-        wp.array(field.depth_rad, dtype=wp.float32, device=device),
-        field.size,
-    ]
-    lengths: Any = wp.empty(len(single), dtype=wp.int64, device=device)
-    none: list[Any] = [wp.empty(0, dtype=dtype, device=device) for dtype in (wp.int64, wp.int32)]
-    kernel = counting_kernel.collect_field_kernel
-    wp.launch(kernel, len(single), [*inputs, False, none[0]], [lengths, none[1]], device=device)
-    starts = np.concatenate([[0], np.cumsum(lengths.numpy())])
-    found: Any = wp.empty(int(starts[-1]), dtype=wp.int32, device=device)
-    first: Any = wp.array(starts[:-1], dtype=wp.int64, device=device)
-    wp.launch(kernel, len(single), [*inputs, True, first], [lengths, found], device=device)
-    indices = found.numpy()
-
-    def sees(view: NDArray[np.int64], rows: NDArray[np.int32]) -> NDArray[np.bool_]:
-        offsets = (posed.points[rows] - centers[view]).astype(np.float32)
-        return frustum.camera_sees(camera, single, view, offsets)
-
-    kept, starts = _decided(indices, starts, sees)
-    return LandmarkSets(starts.astype(np.int32), indices[kept])
-
-
-def _decided(
-    entries: NDArray[np.int32],
-    starts: NDArray[np.int64],
-    sees: Callable[[NDArray[np.int64], NDArray[np.int32]], NDArray[np.bool_]],
-) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
-    """Decide the entries (E,) of V views that the table left to the camera; these are -1 - row, and become rows.
-
-    `sees` returns which of such entries are in view, from their views and rows. Returns which entries are, (E,), and
-    the starts (V + 1,) of the views among them.
-    """
-    unsure = np.flatnonzero(entries < 0)
-    entries[unsure] = -1 - entries[unsure]
-    view = np.searchsorted(starts, unsure, side="right") - 1
-    kept = np.ones(len(entries), dtype=bool)
-    kept[unsure] = sees(view, entries[unsure])
-    n_lost = np.bincount(view[~kept[unsure]], minlength=len(starts) - 1)
-    return kept, np.concatenate([[0], np.cumsum(np.diff(starts) - n_lost)])
 
 
 def compile_kernels(device: str) -> None:
@@ -384,9 +332,9 @@ class FrustumLister(FrustumCounter):
         on_host = entries.numpy()
 
         def sees(view: NDArray[np.int64], rows: NDArray[np.int32]) -> NDArray[np.bool_]:
-            return frustum.camera_sees(camera, self.rotations, views[view, 1], candidates.offsets.numpy()[rows])
+            return camera_sees(camera, self.rotations, views[view, 1], candidates.offsets.numpy()[rows])
 
-        kept, starts = _decided(on_host, starts, sees)
+        kept, starts = decided(on_host, starts, sees)
         there: Any = wp.array(on_host[kept], dtype=wp.int32, device=self.device)
         return ListedViews(starts, there, wp.array(image.numpy()[kept], dtype=wp.vec2, device=self.device))
 
@@ -399,6 +347,147 @@ class FrustumLister(FrustumCounter):
             inputs = [asked, self._axes, self._depth, self._field.size, candidates.sorted, write, first]
             wp.launch(counting_kernel.list_field_kernel, len(views), inputs, outputs, device=self.device)
             return
-        least = wp.float64(frustum.MIN_DEPTH_M)
+        least = wp.float64(MIN_DEPTH_M)
         inputs = [asked, self._axes, self._sides, candidates.sorted, self._rounding, least, write, first]
         wp.launch(counting_kernel.list_kernel, len(views), inputs, outputs, device=self.device)
+
+
+BYTES_TO_RANK = 4  # of every direction at every location, for those who ask which rank it has
+CPU_BLOCK_BYTES = 1 << 24  # on a CPU a block of locations should fit into the cache
+
+
+@dataclass(frozen=True, eq=False)
+class Survey:
+    """What L locations see in D directions."""
+
+    counts: NDArray[np.int32]  # (L, D) landmarks in view, or what another counter counts
+    best: NDArray[np.int32]  # (L, K) the K directions that see most: by falling count, then by rising direction
+    occlusion: StoredOcclusion | None  # landmarks with a free line of sight from each location, if kept
+
+
+@dataclass(frozen=True)
+class SurveyOptions:
+    """How a survey is computed."""
+
+    keep: int = 0  # directions returned in `Survey.best` for each location; 0 for all
+    keep_occlusion: bool = True  # return the mask of unoccluded landmarks
+    device: str = "cpu"
+    threads: int = 0  # on a CPU; 0 for all cores
+    memory_bytes: int = 2 << 30  # bound on the memory that counting takes on the device
+    progress: str | None = None  # text of the progress bar; None shows none
+    counter: type[FrustumCounter] = FrustumCounter  # what is counted
+
+
+def survey(
+    camera: Camera,
+    rotations: ArrayLike,
+    locations: ArrayLike,
+    points: ArrayLike | DevicePoints,
+    occlusion: OcclusionModel,
+    options: SurveyOptions = SurveyOptions(),
+) -> Survey:
+    """Count the unoccluded landmarks (N, 3) m in view from locations (L, 3) m (paper, Sec. 3.2).
+
+    They are counted for each of rotations (D, 3, 3) cam_from_world, and the best directions of each location are
+    returned. Locations are processed in blocks that fit into `options.memory_bytes`; only the result grows with their
+    number, by a bit for each location and landmark if occlusion is kept.
+
+    Raises:
+        MapError: there are no landmarks.
+        SceneError: there are no locations, or `OcclusionModel.check` refuses one.
+        ConfigError: a single location takes more memory than allowed, or the counts more than there is.
+    """
+    at = np.asarray(locations, dtype=np.float64).reshape(-1, 3)
+    if len(at) == 0:
+        raise SceneError("there are no locations to look from", value=0, fix="Refine the grid or check the bounds.")
+    positions = points.positions if isinstance(points, DevicePoints) else np.asarray(points, np.float64).reshape(-1, 3)
+    occlusion.check(at, positions)
+    landmarks = points if isinstance(points, DevicePoints) else DevicePoints(positions, options.device)
+    n_points = len(landmarks)
+    on_gpu = wp.get_device(landmarks.device).is_cuda
+    workers = 1 if on_gpu or occlusion.uses_all_cores else (options.threads or cores())
+    scratch = max(1, options.memory_bytes // (4 * workers))
+    directions = np.asarray(rotations, dtype=np.float64).tobytes()
+    counter = _counter(options.counter, camera, directions, n_points, landmarks.device, scratch)  # type: ignore[arg-type]
+    n_directions = len(counter.rotations)
+    _check_counts(len(at), n_directions)
+    workers, block = _workers_and_block(counter, len(at), n_points, workers, options.memory_bytes, occlusion)
+
+    keep = min(options.keep or n_directions, n_directions)
+    counts = np.empty((len(at), n_directions), dtype=np.int32)
+    best = np.empty((len(at), keep), dtype=np.int32)
+    all_free = np.packbits(np.ones(n_points, dtype=bool))
+    packed = np.empty((len(at) if options.keep_occlusion else 0, len(all_free)), dtype=np.uint8)
+
+    def work(rows: slice) -> int:
+        mask = occlusion.unoccluded_on_device(at[rows], landmarks)
+        counted = counter.count(at[rows], landmarks.double, mask)
+        results: list[tuple[Any, NDArray[Any]]] = [(counted, counts), (_best(counted, keep), best)]
+        if options.keep_occlusion and mask is not None:
+            results.append((_pack(mask, landmarks), packed))
+        elif options.keep_occlusion:
+            packed[rows] = all_free
+        for values, result in results:  # all kernels are in the GPU's queue before the first copy waits for them
+            wp.copy(wp.array(result[rows], dtype=values.dtype, device="cpu", copy=False), values)
+        wp.synchronize_device(landmarks.device)
+        return rows.stop - rows.start
+
+    blocks = [slice(start, min(start + block, len(at))) for start in range(0, len(at), block)]
+    with tqdm(total=len(at), desc=options.progress, unit="location", disable=options.progress is None) as bar:
+        for done in in_threads(work, blocks, workers):
+            bar.update(done)
+    stored = StoredOcclusion(at, packed, n_points, occlusion.name) if options.keep_occlusion else None
+    return Survey(counts, best, stored)
+
+
+@lru_cache(maxsize=2)
+def _counter(
+    kind: Any, camera: Camera, rotations: bytes, n_points: int, device: str, scratch_bytes: int
+) -> FrustumCounter:
+    """The counter for rotations (D, 3, 3) of float64, kept for the next survey of the same directions."""
+    axes = np.frombuffer(rotations).reshape(-1, 3, 3)
+    counter: FrustumCounter = kind(camera, axes, n_points, device, scratch_bytes=scratch_bytes)
+    return counter
+
+
+def _check_counts(n_locations: int, n_directions: int) -> None:
+    """Raise ConfigError if the counts of all views do not fit into memory."""
+    most = fitting(4 + 4 + BYTES_TO_RANK)
+    if n_locations * n_directions > most:
+        problem = f"{n_directions:,} directions at {n_locations:,} locations do not fit into memory"
+        raise ConfigError(problem, fix=f"{most // n_locations:,} directions would fit, or fewer locations.")
+
+
+def _workers_and_block(
+    counter: FrustumCounter, n_locations: int, n_points: int, workers: int, memory_bytes: int, occlusion: OcclusionModel
+) -> tuple[int, int]:
+    """Number of threads, at most `workers`, and of locations in a block, so that the memory suffices."""
+    per_location = counter.bytes_per_location(n_points) + n_points  # and its mask
+    required = per_location + counter.fixed_bytes
+    if required > memory_bytes:
+        problem = f"one location with {n_points:,} landmarks takes {required:,} bytes"
+        raise ConfigError(problem, value=memory_bytes)
+    workers = min(workers, memory_bytes // required)
+    share = memory_bytes // workers - counter.fixed_bytes
+    if counter.device == "cpu" and not occlusion.uses_all_cores:
+        share = min(share, CPU_BLOCK_BYTES)
+    block = min(max(1, share // per_location), counter.max_locations(n_points), -(-n_locations // workers))
+    if occlusion.uses_all_cores:
+        block = min(block, 16 * cores())  # enough for all cores, and the progress bar moves
+    return workers, block
+
+
+def _best(counts: Any, keep: int) -> Any:
+    """The directions (L, K) with the highest of the counts (L, D), ties by direction; Warp arrays of int32."""
+    if counts.device.is_cpu:
+        return wp.array(np.argsort(-counts.numpy(), axis=1, kind="stable")[:, :keep], dtype=wp.int32, device="cpu")
+    best: Any = wp.empty((counts.shape[0], keep), dtype=wp.int32, device=counts.device)
+    wp.launch(counting_kernel.best_kernel, counts.shape, [counts, counts.shape[1], keep], [best], device=counts.device)
+    return best
+
+
+def _pack(mask: Any, landmarks: DevicePoints) -> Any:
+    """A mask (L, N) in the device's order as bits (L, ceil(N / 8)) in the map's order, as `numpy.packbits` has them."""
+    packed: Any = wp.empty((mask.shape[0], (mask.shape[1] + 7) // 8), dtype=wp.uint8, device=mask.device)
+    wp.launch(counting_kernel.pack_kernel, packed.shape, [mask, landmarks.rank], [packed], device=mask.device)
+    return packed

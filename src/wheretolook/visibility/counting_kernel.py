@@ -1,41 +1,26 @@
 """Warp kernels that count and list landmarks by cells of the sphere."""
 
+# mypy: ignore-errors
+# Warp's kernel language is not Python's type system.
+
 from __future__ import annotations
 
 import warp as wp
 
-from wheretolook.visibility.frustum_kernel import in_view, inside_sides, least_product, offset_from, rounding_error
-
-# mypy: ignore-errors
-# Warp's kernel language is not Python's type system.
-
+from wheretolook.visibility.frustum_kernel import (
+    FAR,
+    cell_of,
+    in_view,
+    inside_sides,
+    least_product,
+    offset_from,
+    rounding_error,
+)
 
 wp.set_module_options({"enable_backward": False})
 
-FAR = wp.constant(1.0e15)  # beyond this many metres single precision may overflow
 INSIDE = wp.constant(1)
 BORDER = wp.constant(2)
-
-
-@wp.func
-def sign_of(x: wp.float32) -> wp.float32:
-    return wp.where(x >= 0.0, 1.0, -1.0)
-
-
-@wp.func
-def cell_of(direction: wp.vec3, size: wp.int32) -> wp.int32:
-    """Cell of a direction of any length but zero, on the octahedral map of size x size cells."""
-    scale = 1.0 / (wp.abs(direction[0]) + wp.abs(direction[1]) + wp.abs(direction[2]))
-    u = direction[0] * scale
-    v = direction[1] * scale
-    if direction[2] < 0.0:
-        folded = (1.0 - wp.abs(v)) * sign_of(u)
-        v = (1.0 - wp.abs(u)) * sign_of(v)
-        u = folded
-    half = 0.5 * wp.float32(size)
-    column = wp.clamp(wp.int32((u + 1.0) * half), 0, size - 1)
-    row = wp.clamp(wp.int32((v + 1.0) * half), 0, size - 1)
-    return row * size + column
 
 
 @wp.kernel
@@ -337,13 +322,6 @@ def pack_kernel(mask: wp.array2d[wp.bool], rank: wp.array[wp.int32], packed: wp.
     packed[location, byte] = wp.uint8(bits)
 
 
-# mypy: ignore-errors
-# Warp's kernel language is not Python's type system.
-
-
-wp.set_module_options({"enable_backward": False})
-
-
 @wp.kernel
 def rows_kernel(places: wp.array2d[wp.vec2i], starts: wp.array[wp.int32], n_cells: wp.int32, rows: wp.array[wp.int32]):
     """Write which landmark each entry is that `sort_kernel` has sorted."""
@@ -472,41 +450,4 @@ def list_field_kernel(
             entries[begin + number] = -1 - entry
             image[begin + number] = image_of(rotation, landmarks.offsets[entry])
         number += wp.int64(1)
-    lengths[view] = number
-
-
-@wp.kernel
-def collect_field_kernel(
-    rotations: wp.array[wp.mat33],
-    centers: wp.array[wp.vec3d],
-    location_rows: wp.array[wp.int32],
-    points: wp.array[wp.vec3d],
-    starts: wp.array[wp.int32],
-    unoccluded: wp.array[wp.int32],
-    depth: wp.array[wp.float32],
-    field_size: wp.int32,
-    write: wp.bool,
-    first: wp.array[wp.int64],
-    lengths: wp.array[wp.int64],
-    indices: wp.array[wp.int32],
-):
-    """As `collect_kernel`, by a table of the field of view. What it cannot decide is listed as -1 - landmark."""
-    view = wp.tid()
-    location = location_rows[view]
-    number = wp.int64(0)
-    begin = wp.int64(0)
-    if write:
-        begin = first[view]
-    for entry in range(starts[location], starts[location + 1]):
-        landmark = unoccluded[entry]
-        offset = offset_from(centers[view], points[landmark])
-        if wp.isfinite(offset):
-            distance = wp.length(offset)
-            inside_by = wp.float32(0.0)
-            if distance > 0.0 and distance < FAR:
-                inside_by = depth[cell_of(rotations[view] * offset, field_size)]
-            if inside_by >= 0.0:
-                if write:
-                    indices[begin + number] = wp.where(inside_by > 0.0, landmark, -1 - landmark)
-                number += wp.int64(1)
     lengths[view] = number

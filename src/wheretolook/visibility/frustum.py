@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
@@ -381,3 +382,61 @@ def landmarks_in_view_plain(views: PosedViews) -> LandmarkSets:
         sets.append(candidates[in_view(views.camera, rotation[None], offsets)[0]])
     lengths = np.array([len(rows) for rows in sets], dtype=np.int64)
     return LandmarkSets(_starts(lengths), np.concatenate([np.empty(0, np.int32), *sets]))
+
+
+def in_view_by_table(posed: PosedViews, points: Any, device: str = "cpu") -> LandmarkSets:
+    """What `landmarks_in_view` gives for a COLMAP camera, by a table of its field of view; on the host.
+
+    The table takes a second to make, and the camera is asked only about landmarks near the border of the view. Points
+    are those of `points_on_device`.
+    """
+    camera = posed.camera
+    assert isinstance(camera, ColmapCamera)
+    wp.load_module(frustum_kernel, device=device)
+    field = tabulate(camera)
+    rotations, centers = split_poses(posed.cam_from_world)
+    single = rotations.astype(np.float32)
+    inputs = [
+        wp.array(single, dtype=wp.mat33, device=device),
+        wp.array(centers, dtype=wp.vec3d, device=device),
+        wp.array(np.asarray(posed.location_rows, dtype=np.int32), dtype=wp.int32, device=device),
+        points,
+        *sets_on_device(posed.unoccluded, device),
+        wp.array(field.depth_rad, dtype=wp.float32, device=device),
+        field.size,
+    ]
+    lengths: Any = wp.empty(len(single), dtype=wp.int64, device=device)
+    none: list[Any] = [wp.empty(0, dtype=dtype, device=device) for dtype in (wp.int64, wp.int32)]
+    kernel = frustum_kernel.collect_field_kernel
+    wp.launch(kernel, len(single), [*inputs, False, none[0]], [lengths, none[1]], device=device)
+    starts = np.concatenate([[0], np.cumsum(lengths.numpy())])
+    found: Any = wp.empty(int(starts[-1]), dtype=wp.int32, device=device)
+    first: Any = wp.array(starts[:-1], dtype=wp.int64, device=device)
+    wp.launch(kernel, len(single), [*inputs, True, first], [lengths, found], device=device)
+    indices = found.numpy()
+
+    def sees(view: NDArray[np.int64], rows: NDArray[np.int32]) -> NDArray[np.bool_]:
+        offsets = (posed.points[rows] - centers[view]).astype(np.float32)
+        return camera_sees(camera, single, view, offsets)
+
+    kept, starts = decided(indices, starts, sees)
+    return LandmarkSets(starts.astype(np.int32), indices[kept])
+
+
+def decided(
+    entries: NDArray[np.int32],
+    starts: NDArray[np.int64],
+    sees: Callable[[NDArray[np.int64], NDArray[np.int32]], NDArray[np.bool_]],
+) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
+    """Decide the entries (E,) of V views that the table left to the camera; these are -1 - row, and become rows.
+
+    `sees` returns which of such entries are in view, from their views and rows. Returns which entries are, (E,), and
+    the starts (V + 1,) of the views among them.
+    """
+    unsure = np.flatnonzero(entries < 0)
+    entries[unsure] = -1 - entries[unsure]
+    view = np.searchsorted(starts, unsure, side="right") - 1
+    kept = np.ones(len(entries), dtype=bool)
+    kept[unsure] = sees(view, entries[unsure])
+    n_lost = np.bincount(view[~kept[unsure]], minlength=len(starts) - 1)
+    return kept, np.concatenate([[0], np.cumsum(np.diff(starts) - n_lost)])

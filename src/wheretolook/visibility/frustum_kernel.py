@@ -12,6 +12,8 @@ import warp as wp
 
 wp.set_module_options({"enable_backward": False})
 
+FAR = wp.constant(1.0e15)  # beyond this many metres single precision may overflow
+
 
 @wp.struct
 class ViewBatch:
@@ -90,6 +92,27 @@ def pixel_of(axes: wp.mat33, offset: wp.vec3, focal: wp.vec2d, center: wp.vec2d)
     return wp.vec2d(x, y)
 
 
+@wp.func
+def sign_of(x: wp.float32) -> wp.float32:
+    return wp.where(x >= 0.0, 1.0, -1.0)
+
+
+@wp.func
+def cell_of(direction: wp.vec3, size: wp.int32) -> wp.int32:
+    """Cell of a direction of any length but zero, on the octahedral map of size x size cells."""
+    scale = 1.0 / (wp.abs(direction[0]) + wp.abs(direction[1]) + wp.abs(direction[2]))
+    u = direction[0] * scale
+    v = direction[1] * scale
+    if direction[2] < 0.0:
+        folded = (1.0 - wp.abs(v)) * sign_of(u)
+        v = (1.0 - wp.abs(u)) * sign_of(v)
+        u = folded
+    half = 0.5 * wp.float32(size)
+    column = wp.clamp(wp.int32((u + 1.0) * half), 0, size - 1)
+    row = wp.clamp(wp.int32((v + 1.0) * half), 0, size - 1)
+    return row * size + column
+
+
 @wp.kernel
 def collect_kernel(
     views: ViewBatch,
@@ -116,3 +139,40 @@ def collect_kernel(
                     indices[out_starts[view] + count] = views.unoccluded[entry]
                 count += 1
     lengths[view] = count
+
+
+@wp.kernel
+def collect_field_kernel(
+    rotations: wp.array[wp.mat33],
+    centers: wp.array[wp.vec3d],
+    location_rows: wp.array[wp.int32],
+    points: wp.array[wp.vec3d],
+    starts: wp.array[wp.int32],
+    unoccluded: wp.array[wp.int32],
+    depth: wp.array[wp.float32],
+    field_size: wp.int32,
+    write: wp.bool,
+    first: wp.array[wp.int64],
+    lengths: wp.array[wp.int64],
+    indices: wp.array[wp.int32],
+):
+    """As `collect_kernel`, by a table of the field of view. What it cannot decide is listed as -1 - landmark."""
+    view = wp.tid()
+    location = location_rows[view]
+    number = wp.int64(0)
+    begin = wp.int64(0)
+    if write:
+        begin = first[view]
+    for entry in range(starts[location], starts[location + 1]):
+        landmark = unoccluded[entry]
+        offset = offset_from(centers[view], points[landmark])
+        if wp.isfinite(offset):
+            distance = wp.length(offset)
+            inside_by = wp.float32(0.0)
+            if distance > 0.0 and distance < FAR:
+                inside_by = depth[cell_of(rotations[view] * offset, field_size)]
+            if inside_by >= 0.0:
+                if write:
+                    indices[begin + number] = wp.where(inside_by > 0.0, landmark, -1 - landmark)
+                number += wp.int64(1)
+    lengths[view] = number

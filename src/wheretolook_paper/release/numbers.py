@@ -262,6 +262,14 @@ def prose(numbers: Numbers) -> Mapping[tuple[str, str], list[str]]:
         for name in ("right_2", "right_3", "right_4")
     ]
     looks = [f"{100 * share:.0f}" for share in (two, single)]
+    sets = numbers.table("looks.csv")
+    sets = sets[sets["split"] == "test"]
+    sure = (sets["sure"] * sets["n_locations"]).round()
+    correct = (sure * sets["sure_right"]).round()
+    gains = []
+    for n in (2, 3, 5):
+        row = numbers.row("looks.csv", split="test", strategy="together", n_looks=n)
+        gains += [f"{100 * row[name]:.1f}" for name in ("gain", "gain_low", "gain_high")]
     turned = [f"{100 * rates[policy]['right_4']:.0f}" for policy in ("gain", "even")]
     ours, other = "scores.csv", "generalization.csv"
     paired = []
@@ -285,6 +293,15 @@ def prose(numbers: Numbers) -> Mapping[tuple[str, str], list[str]]:
     pair = rf"{number} points on the apartments \[{number}, {number}\] and {number} on the six scenes"
     return {
         ("README.md", r"two localize at (\d+) of 100 .* single view localizes at (\d+)"): looks,
+        ("README.md", r"([\d,]+) of ([\d,]+) poses with a confidence"): [f"{correct.sum():,.0f}", f"{sure.sum():,.0f}"],
+        ("docs/looks.md", r"([\d,]+) of ([\d,]+) sets have a .*; ([\d,]+) of these are correct"): [
+            *(f"{count:,.0f}" for count in (sure.sum(), sets["n_locations"].sum(), correct.sum()))
+        ],
+        (
+            "docs/looks.md",
+            rf"\+{number} points with two views \({number} to {number}\), \+{number} with three \({number} to {number}\), "
+            rf"\+{number} with five \({number} to {number}\)",
+        ): gains,
         ("README.md", r"after four views (\d+) of 100 poses are correct, (\d+) by even"): turned,
         ("docs/lost.md", r"close (\d+) % after two views, (\d+) % after three and (\d+) % after four"): closed,
         (

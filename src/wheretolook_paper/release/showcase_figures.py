@@ -19,8 +19,8 @@ from wheretolook.planning.config import PlanConfig
 from wheretolook.planning.method_paths import path_views, plan_by_methods
 from wheretolook.scorers.base import Scorer
 from wheretolook.scorers.mlp.network import BinnedNetworkScorer
+from wheretolook.visibility.counting import Survey, SurveyOptions, survey
 from wheretolook.visibility.frustum import pixels_of
-from wheretolook.visibility.survey import Survey, SurveyOptions, survey
 from wheretolook_paper.figures.inputs import BinnedImage
 from wheretolook_paper.figures.overview import View, outcome_in_words, rendered_views
 from wheretolook_paper.figures.peaks import spread_extrema

@@ -13,7 +13,7 @@ from torch import Tensor
 from wheretolook.geometry.poses import Float, check_poses
 from wheretolook.inputs.landmark_features import LandmarkDescriber, ViewLandmarks
 from wheretolook.inputs.localization_map import LocalizationMap
-from wheretolook.scorers.matchability.network import MatchabilityNetwork, expected_parts
+from wheretolook.scorers.set.network import MatchabilityNetwork, expected_parts
 from wheretolook.scorers.set.score import LandmarkScorer
 from wheretolook.training.trained_network import QUANTITIES, TrainedNetwork, camera_quantities, view_quantities
 from wheretolook_paper.fisher.metrics import METRICS, metric_of

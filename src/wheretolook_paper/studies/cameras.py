@@ -145,10 +145,11 @@ def main(
     for root in datasets:
         table = summary(scored(root, split, methods, paths), list(methods))
         table.insert(0, "dataset", root.name)
+        table.insert(1, "split", split)
         tables.append(table)
         print(f"\n{root.name}, {split}")
         shown = table[(table["group"] == "mean") | table["group"].str.startswith("all ")]
-        print(shown.drop(columns=["dataset"]).to_string(index=False, float_format=lambda x: f"{x:.3f}"))
+        print(shown.drop(columns=["dataset", "split"]).to_string(index=False, float_format=lambda x: f"{x:.3f}"))
         if out is not None:
             others = pd.read_csv(out) if out.is_file() else pd.DataFrame({"dataset": []})
             others = others[~others["dataset"].isin([path.name for path in datasets])]

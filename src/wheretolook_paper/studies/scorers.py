@@ -29,8 +29,8 @@ from jsonargparse import auto_cli
 from wheretolook.commands.train import train_methods as train
 from wheretolook.dataset.layout import Dataset
 from wheretolook.inputs.landmark_features import ATTRIBUTES
-from wheretolook.scorers.mlp.config import MlpConfig
-from wheretolook.scorers.set.config import SetConfig
+from wheretolook.scorers.mlp import MlpConfig
+from wheretolook.scorers.set import SetConfig
 from wheretolook.scorers.set.learn import SetDataModule, learn_set
 from wheretolook.scorers.train_config import TrainConfig
 from wheretolook.tracking.runs import start_run

@@ -1,24 +1,78 @@
-"""Scorer of scene-adapted weights."""
+"""Weights adapted to a scene, and their scorer."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
+from typing import Any, Self
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 from scipy.special import expit
 
 from wheretolook.geometry.poses import Float, check_locations
 from wheretolook.geometry.views import Views
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.scorers.adapted.calibration import finite_log_odds
-from wheretolook.scorers.adapted.network import AdaptedNetwork
-from wheretolook.scorers.adapted.place import MIN_SHARE, share_of_place
 from wheretolook.scorers.base import Scorer
 from wheretolook.scorers.registry import BuildOptions
+from wheretolook.scorers.set.network import SetNetwork
 from wheretolook.scorers.set.score import SetScorer
-from wheretolook.training.trained_network import TrainedNetwork
+from wheretolook.training.trained_network import StoredNetwork, TrainedNetwork, finite
 from wheretolook.utils.errors import WeightsError
+
+MAX_PLACE = 1_000_000  # landmarks: more are no weights of this program
+
+
+class AdaptedNetwork(StoredNetwork):
+    """A set network and its calibration.
+
+    `place` holds some of the map's landmarks, by which the scene is recognized, in the map's frame in metres.
+    """
+
+    place: torch.Tensor  # (P, 3) float64 m
+
+    def __init__(self, network: SetNetwork, scale: float, offset: float, place: int) -> None:
+        super().__init__()
+        self.network = network
+        self.base_scale = scale
+        self.base_offset = offset
+        self.register_buffer("place", torch.zeros((place, 3), dtype=torch.float64))
+
+    def description(self) -> dict[str, Any]:
+        """See `StoredNetwork.description`."""
+        base = {"network": self.network.description(), "scale": self.base_scale, "offset": self.base_offset}
+        return {"base": base, "place": len(self.place)}
+
+    @classmethod
+    def of_description(cls, stored: Mapping[str, Any]) -> Self:
+        """See `StoredNetwork.of_description`."""
+        if "kernel" in stored:
+            raise ValueError(
+                "a Gaussian process, which is no longer applied, corrects them: run `wheretolook adapt` again"
+            )
+        base = stored["base"]
+        place = int(stored["place"])
+        if not 0 <= place <= MAX_PLACE:
+            raise ValueError(f"invalid number of landmarks {place}")
+        network = SetNetwork.of_description(base["network"])
+        return cls(network, finite(base["scale"]), finite(base["offset"]), place)
+
+
+SAME_M = 0.05
+MIN_SHARE = 0.5
+"""A map is of the scene if this share of the stored landmarks has one of the map's within this distance. A map with
+other filters, or reconstructed again in the same frame, still is."""
+
+
+def share_of_place(place: Float, landmarks: Float) -> float:
+    """Return the share of stored landmarks (P, 3) m that a map's landmarks (N, 3) m contain; 1 if none are stored."""
+    if len(place) == 0:
+        return 1.0
+    return float((cKDTree(landmarks).query(place)[0] <= SAME_M).mean()) if len(landmarks) else 0.0
+
 
 MIN_DISTANCE = 1e-12  # of probabilities from 0 and 1, so that their log-odds are finite
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from wheretolook.inputs.channels import CHANNELS
-from wheretolook.scorers.mlp.config import MlpConfig
+from wheretolook.scorers.mlp import MlpConfig
 from wheretolook.scorers.mlp.network import NetworkSpec, ViewpointNetwork
 from wheretolook.training.data import ViewpointDataModule
 from wheretolook.training.fit import home_device

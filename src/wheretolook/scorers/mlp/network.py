@@ -17,7 +17,7 @@ from wheretolook.inputs.channels import ALL_CHANNELS, CHANNELS, Layout
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.inputs.statistics import FeatureStatistics
 from wheretolook.scorers.base import BLOCK, BinnedScorer, check_field_of_view
-from wheretolook.scorers.mlp.config import MlpConfig
+from wheretolook.scorers.mlp import MlpConfig
 from wheretolook.training.trained_network import (
     RangeWatch,
     StoredNetwork,

@@ -1,11 +1,93 @@
-"""A network over the set of visible landmarks."""
+"""Networks over landmarks: `set`, over the set of visible landmarks, and `matchability`, over single landmarks."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from math import inf
+
+from wheretolook.inputs.channels import ATTRIBUTES, OF_SIZE
 from wheretolook.scorers.registry import Learner, Method, imported, network_scorer
-from wheretolook.scorers.set.config import SetConfig
+from wheretolook.training.config import FittingConfig, check_range
+from wheretolook.utils.errors import ConfigError
+
+
+@dataclass(frozen=True)
+class LandmarksConfig(FittingConfig):
+    """Options of a network over single landmarks.
+
+    Args:
+        landmarks: maximum number of landmarks of a view in a training step, chosen at random.
+        width: units of the layers for single landmarks.
+        hidden: attributes (`inputs.channels.ATTRIBUTES`) that are no inputs; by default those that depend on the size
+            of a scene, on which matching does not depend.
+        enlarged: maximum factor by which scenes are scaled up or down in training; 1 does not scale them.
+    """
+
+    landmarks: int = 64
+    width: int = 48
+    hidden: tuple[str, ...] = OF_SIZE
+    enlarged: float = 3.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_range(self, "landmarks", "width", at_least=1)
+        if not 1 <= self.enlarged < inf:
+            raise ConfigError("scenes can be enlarged by a factor of 1 or more", value=self.enlarged)
+        if unknown := [name for name in self.hidden if name not in ATTRIBUTES]:
+            known = f"There are {', '.join(ATTRIBUTES)}."
+            raise ConfigError("hidden names an attribute that there is not", value=unknown[0], fix=known)
+
+
+@dataclass(frozen=True)
+class MatchabilityConfig(LandmarksConfig):
+    """Options of the probability that a visible landmark is detected."""
+
+    epochs: int = 6
+    batch_size: int = 256
+
+
+@dataclass(frozen=True)
+class SetConfig(LandmarksConfig):
+    """Options of the network over the set of visible landmarks.
+
+    With few training views, batches get smaller and epochs more (`wheretolook.scorers.set.learn.of_size`).
+
+    Args:
+        landmark_loss: weight of the loss of landmark detection, where matches are stored.
+        pooled: features that attention pools in addition to the expected information on the pose.
+        head: units of the head's layers.
+        dropout: share of the head's units dropped.
+        from_matchability: start from `weights/matchability.safetensors` where the dataset has it.
+    """
+
+    epochs: int = 8
+    batch_size: int = 1024
+    learning_rate: float = 3e-3
+    landmarks: int = 192
+    landmark_loss: float = 0.5
+    pooled: int = 0
+    head: int = 48
+    dropout: float = 0.1
+    from_matchability: bool = True
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_range(self, "head", at_least=1)
+        check_range(self, "landmark_loss", "pooled", at_least=0)
+        check_range(self, "dropout", at_least=0, below=1)
+
+    @property
+    def starts_from(self) -> str:
+        """Name of the matchability model, or none."""
+        return "matchability" if self.from_matchability else ""
+
 
 METHODS = (
+    Method(
+        name="matchability",
+        about="The probability that a visible landmark is detected.",
+        learner=Learner(imported("wheretolook.scorers.set.learn:learn_matchability"), MatchabilityConfig),
+    ),
     Method(
         name="set",
         about="Network over the set of visible landmarks: their probabilities of detection and their information on "

@@ -138,7 +138,7 @@ def draw(table: pd.DataFrame, path: Path) -> None:
     """Draw times by the number of landmarks, and by the number of locations, on logarithmic axes."""
     import matplotlib.pyplot as plt
 
-    from wheretolook.figures.style import save_figure
+    from wheretolook.figures.floor_plan import save_figure
 
     figure, axes = plt.subplots(1, 2, figsize=(8, 3.2), layout="constrained")
     for axis, names, label in ((axes[0], (MATCHED, COUNTED), "landmarks"), (axes[1], (SCORED,), "locations")):

@@ -20,9 +20,9 @@ from common import points_on_surface, room_map, timed
 
 from wheretolook.geometry.lattices import VoxelGrid, fibonacci_sphere
 from wheretolook.inputs.localization_map import LocalizationMap
+from wheretolook.planning.routes import TurnLimit, best_sequence
 from wheretolook.planning.scene_map import build_viewpoint_map
 from wheretolook.planning.stops import refine_directions
-from wheretolook.planning.view_sequence import TurnLimit, best_sequence
 from wheretolook.planning.viewpoint_map import ViewpointMap
 from wheretolook.rendering.raycasting import MeshRaycaster
 from wheretolook.scenes.config import ApartmentConfig

@@ -248,8 +248,8 @@ def bounded(args: argparse.Namespace, device: str) -> list[dict[str, Any]]:
 
 def draw(args: argparse.Namespace) -> None:
     """Write tables and figures of earlier results, and log them to MLflow if asked to."""
-    from wheretolook.figures.style import save_figure
-    from wheretolook.tracking.store import TrackingConfig
+    from wheretolook.figures.floor_plan import save_figure
+    from wheretolook.tracking import TrackingConfig
     from wheretolook_paper.figures.runtimes import runtime_figure, scaling_figure
     from wheretolook_paper.release.benchmark_runs import RUNTIMES_CSV, SCALING_CSV, log_runtimes
 

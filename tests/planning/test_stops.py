@@ -13,10 +13,9 @@ from wheretolook.geometry.lattices import direction_lattice
 from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.planning.config import PathConfig, StopConfig
-from wheretolook.planning.method_paths import path_views
-from wheretolook.planning.routes import PlannedPath
+from wheretolook.planning.routes import PlannedPath, TurnLimit, best_sequence
+from wheretolook.planning.scene_map import path_views
 from wheretolook.planning.stops import stops_along, within_pitch
-from wheretolook.planning.view_sequence import TurnLimit, best_sequence
 from wheretolook.scorers.base import Scorer
 from wheretolook.scorers.registry import make_scorer
 from wheretolook.utils.errors import ConfigError

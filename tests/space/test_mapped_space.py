@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from wheretolook.space.config import MappedSpaceConfig
-from wheretolook.space.mapped_space import MappedSpace
+from wheretolook.space.free_space import MappedSpace
 from wheretolook.utils.errors import ConfigError, MapError
 
 WALL = np.stack(np.meshgrid([3.0], np.linspace(-2, 2, 41), np.linspace(0, 2, 21), indexing="ij"), -1).reshape(-1, 3)

@@ -30,7 +30,7 @@ from wheretolook.dataset.environment import ColmapEnvironment, ColmapFiles, Scen
 from wheretolook.dataset.layout import Dataset, SceneFolder, views_by_camera
 from wheretolook.mapping.config import FrameOptions, place_name
 from wheretolook.scorers.weights import load_scorer, resolve_weights
-from wheretolook.tracking.store import TrackingConfig, check_store, kept_if_not_logged
+from wheretolook.tracking import TrackingConfig, check_store, kept_if_not_logged
 from wheretolook.utils.errors import (
     ConfigError,
     MapError,
@@ -272,7 +272,7 @@ class Adapt(SceneOptions, LabelOptions, FrameOptions):
         return path if is_better else None
 
     def _log_gain(self, target: _Target, adapted: Adapted, views: LocalizedViews, gain: Gain, is_better: bool) -> None:
-        from wheretolook.tracking.runs import log, start_run
+        from wheretolook.tracking import log, start_run
 
         params = {"dataset": target.dataset, "scene": target.name, "weights": target.weights, **_counts(views)}
         params |= {"scale": adapted.scale, "offset": adapted.offset}

@@ -13,9 +13,8 @@ from wheretolook.commands.options import Log, Progress, ignore_progress, load_da
 from wheretolook.dataset.dataset_lock import reads_dataset
 from wheretolook.geometry.similarity import Similarity
 from wheretolook.planning.config import PlanConfig
-from wheretolook.tracking.runs import joined, start_run
-from wheretolook.tracking.runs import log as log_to_run
-from wheretolook.tracking.store import TrackingConfig, check_store, kept_if_not_logged
+from wheretolook.tracking import TrackingConfig, check_store, joined, kept_if_not_logged, start_run
+from wheretolook.tracking import log as log_to_run
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.files import write_text
 from wheretolook.utils.package import reports
@@ -69,7 +68,7 @@ class Plan(SceneOrMapOptions):
             SceneError, MapError: the scene has no free location, or no map with a scale.
             TrackingError: the tracking store cannot be used.
         """
-        from wheretolook.planning.method_paths import path_views, plan_by_methods
+        from wheretolook.planning.scene_map import path_views, plan_by_methods
         from wheretolook.utils.package import require
 
         dataset = load_dataset(self, "map")
@@ -112,7 +111,7 @@ WAIT_S = 120.0  # for another plan to write its path into the same folder
 
 def _summary(path: PlannedPath) -> str:
     """Describe a path and its stops in a line."""
-    from wheretolook.planning.view_sequence import lengths_along
+    from wheretolook.planning.routes import lengths_along
 
     text = f"{path.length_m:.2f} m, {path.turn_deg:.0f} degrees of turning, views: {len(path.positions)}"
     if not np.isnan(path.scores).any():

@@ -32,8 +32,7 @@ if TYPE_CHECKING:  # pandas and Warp are imported when first needed
     from wheretolook.mapping.mapped_images import ColmapSource, MappedImages
     from wheretolook.rendering.raycasting import MeshRaycaster
     from wheretolook.rendering.warp_renderer import Renderer
-    from wheretolook.space.free_space import FreeSpace
-    from wheretolook.space.mapped_space import MappedSpace
+    from wheretolook.space.free_space import FreeSpace, MappedSpace
     from wheretolook.visibility.occlusion import OcclusionModel
 
 
@@ -150,7 +149,7 @@ class Environment(ABC):
     @cached_property
     def mapped_space(self) -> MappedSpace:
         """Where a camera can be according to landmarks and mapping images."""
-        from wheretolook.space.mapped_space import MappedSpace
+        from wheretolook.space.free_space import MappedSpace
 
         poses = np.empty((0, 3, 4)) if self.mapping_poses is None else self.mapping_poses
         return MappedSpace(self.landmarks.points, camera_centers(poses.astype(np.float64)), self.config.mapped_space)

@@ -26,8 +26,7 @@ NEAR_DEG = 40.0  # largest angle between its directions and that of the image
 BYTES_PER_VIEWPOINT = 600  # while a table of viewpoints is made and written
 
 if TYPE_CHECKING:
-    from wheretolook.space.free_space import FreeSpace
-    from wheretolook.space.mapped_space import MappedSpace
+    from wheretolook.space.free_space import FreeSpace, MappedSpace
 
 
 def free_locations(grid: VoxelGrid, free_space: FreeSpace | MappedSpace) -> NDArray[np.int64]:

@@ -49,7 +49,7 @@ from wheretolook.geometry.poses import Float
 from wheretolook.geometry.views import Views
 from wheretolook.scorers.random import RandomScorer
 from wheretolook.scorers.registry import is_probability
-from wheretolook.tracking.runs import (
+from wheretolook.tracking import (
     ALL_METHODS,
     AUC,
     BEST_TAG,
@@ -57,6 +57,7 @@ from wheretolook.tracking.runs import (
     REGRET,
     SHARE,
     NestedRun,
+    TrackingConfig,
     artifact,
     fingerprint_of,
     joined,
@@ -66,7 +67,6 @@ from wheretolook.tracking.runs import (
     newest_run,
     start_run,
 )
-from wheretolook.tracking.store import TrackingConfig
 from wheretolook.utils.errors import check_choice
 from wheretolook.utils.files import fingerprint, temporary_folder
 from wheretolook.visibility.config import OcclusionConfig

@@ -1,9 +1,12 @@
-"""Floor plan of a map's landmarks and of views, from straight above."""
+"""Figures: floor plans with views, images with matches, and the style and files of all figures."""
 
 from __future__ import annotations
 
+import io
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -11,8 +14,82 @@ from matplotlib.figure import Figure
 from matplotlib.style import context
 from numpy.typing import NDArray
 
-from wheretolook.figures.style import BLUE, GREY, INK, RC, VERMILION, frame, new_figure
+from wheretolook.figures import KINDS
 from wheretolook.geometry.poses import Float
+from wheretolook.utils.errors import ConfigError
+from wheretolook.utils.files import write_bytes
+
+INK = "#333333"
+GREY = "#7a7a7a"
+BLUE = "#0072B2"
+VERMILION = "#D55E00"
+"""Colours; the last two of the colour-blind-safe palette of Okabe and Ito (2008)."""
+
+RC: dict[str, Any] = {
+    "axes.edgecolor": INK,
+    "axes.labelcolor": INK,
+    "text.color": INK,
+    "xtick.color": INK,
+    "ytick.color": INK,
+    "grid.color": "#d9d9d9",
+    "font.size": 10,
+    "axes.titlesize": 11,
+    "axes.labelsize": 10,
+    "legend.fontsize": 9,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.linewidth": 0.6,
+    "lines.linewidth": 1.6,
+    "hatch.linewidth": 0.7,
+    "legend.frameon": False,
+    "figure.dpi": 100,
+    "savefig.dpi": 160,
+    "savefig.bbox": "tight",
+    "svg.hashsalt": "wheretolook",
+    "svg.fonttype": "none",
+    "pdf.fonttype": 42,
+}
+"""Matplotlib parameters of figures on screen."""
+
+
+def new_figure(width_in: float, height_in: float) -> Figure:
+    """Create an empty figure independent of pyplot. Draw into it within `with context(RC):`."""
+    with context(RC):
+        return Figure(figsize=(width_in, height_in), layout="constrained")
+
+
+def frame(axes: Axes, color: str = INK, linewidth: float = 0.5) -> None:
+    """Draw a frame around the axes of an image, without ticks and grid."""
+    axes.set(xticks=[], yticks=[])
+    axes.grid(False)
+    axes.spines[:].set(visible=True, linewidth=linewidth, color=color)
+
+
+_METADATA: dict[str, tuple[str, dict[str, Any]]] = {
+    "png": ("Description", {"Software": None}),
+    "pdf": ("Subject", {"CreationDate": None, "Creator": None}),
+    "svg": ("Description", {"Date": None}),
+}
+"""The field of a file's metadata that holds the note, and fields without dates and versions."""
+
+
+def save_figure(figure: Figure, path: Path, note: str = "") -> None:
+    """Write a figure to `path` (.png, .pdf or .svg) atomically; equal figures give equal bytes.
+
+    `note`, such as the runs that the figure shows, is stored in the file's metadata. Raises ConfigError for another
+    format.
+    """
+    kind = path.suffix[1:].lower()
+    if kind not in KINDS:
+        raise ConfigError("unsupported figure format", path=path, fix=f"Use {', '.join(KINDS)}.")
+    field, metadata = _METADATA[kind]
+    buffer = io.BytesIO()  # the PDF writer does not report the cause of a failed write
+    with context(RC):
+        figure.savefig(buffer, format=kind, metadata=metadata | ({field: note} if note else {}))
+    write_bytes(path, buffer.getvalue())
+
 
 MAX_LANDMARKS = 30_000  # drawn
 MAX_NAMES = 30  # with more locations, none is named

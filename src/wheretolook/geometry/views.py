@@ -15,9 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wheretolook.geometry.camera import Camera, write_cameras
-from wheretolook.geometry.camera_turns import pan_tilt_angles
 from wheretolook.geometry.pose_files import images_text, pose_texts, poses_of_rows, read_named_rows, tum_text
-from wheretolook.geometry.poses import Float, camera_centers, quaternion_from_rotation
+from wheretolook.geometry.poses import Float, camera_centers, pan_tilt_angles, quaternion_from_rotation
 from wheretolook.utils.errors import ConfigError, StorageError, check_choice
 from wheretolook.utils.files import check_output_folder, write_json, write_text
 

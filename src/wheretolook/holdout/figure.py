@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.style import context
 
 from wheretolook.evaluation.statistics import reliability
-from wheretolook.figures.style import BLUE, INK, RC, VERMILION, new_figure
+from wheretolook.figures.floor_plan import BLUE, INK, RC, VERMILION, new_figure
 from wheretolook.geometry.poses import Float
 
 if TYPE_CHECKING:

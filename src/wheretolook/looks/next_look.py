@@ -12,9 +12,8 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
-from wheretolook.geometry.camera_turns import pan_tilt_angles, within
 from wheretolook.geometry.lattices import direction_lattice
-from wheretolook.geometry.poses import Float, camera_centers, rotation_looking_along
+from wheretolook.geometry.poses import Float, camera_centers, pan_tilt_angles, rotation_looking_along, within
 from wheretolook.localization.confidence import RIGHT_PLACE, probabilities
 from wheretolook.utils.errors import PlanningError
 

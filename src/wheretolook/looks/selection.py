@@ -15,9 +15,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from wheretolook.geometry.camera_turns import TOLERANCE_DEG
 from wheretolook.geometry.pose_information import N_NUMBERS, PRIOR, bearing_numbers, information_matrices
-from wheretolook.geometry.poses import Float, poses_looking_along, rotation_angle_deg, rotation_looking_along
+from wheretolook.geometry.poses import (
+    TOLERANCE_DEG,
+    Float,
+    poses_looking_along,
+    rotation_angle_deg,
+    rotation_looking_along,
+)
 from wheretolook.localization.confidence import LogisticRegression
 from wheretolook.utils.errors import ConfigError, PlanningError
 

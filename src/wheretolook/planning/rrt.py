@@ -13,14 +13,21 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import label
 from tqdm.auto import tqdm
 
-from wheretolook.geometry.camera_turns import check_axis
 from wheretolook.geometry.lattices import VoxelGrid, axes_of_angles
-from wheretolook.geometry.poses import Float
+from wheretolook.geometry.poses import Float, check_axis
 from wheretolook.geometry.similarity import Similarity
 from wheretolook.mapping.map_frame import IDENTITY
 from wheretolook.planning.config import PathConfig
-from wheretolook.planning.routes import IMPROVEMENT, SEARCH, SHORT_ROUTE, PlannedPath, RouteSamples, RouteViews
-from wheretolook.planning.view_sequence import between, lengths_along
+from wheretolook.planning.routes import (
+    IMPROVEMENT,
+    SEARCH,
+    SHORT_ROUTE,
+    PlannedPath,
+    RouteSamples,
+    RouteViews,
+    between,
+    lengths_along,
+)
 from wheretolook.planning.viewpoint_map import ViewpointMap
 from wheretolook.utils.errors import PlanningError
 

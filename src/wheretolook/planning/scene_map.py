@@ -1,4 +1,4 @@
-"""Build a viewpoint map: of a scene, or of any occlusion model and scorer."""
+"""Viewpoint maps of a scene, or of any occlusion model and scorer, and paths planned by several methods."""
 
 from __future__ import annotations
 
@@ -14,16 +14,22 @@ from tqdm.auto import tqdm
 
 from wheretolook.dataset.config import Accuracy
 from wheretolook.dataset.environment import Environment
+from wheretolook.dataset.layout import Dataset
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.lattices import ViewLattice, VoxelGrid
-from wheretolook.geometry.poses import Float, poses_looking_along, rotation_looking_along
+from wheretolook.geometry.poses import Float, poses_looking_along, rotation_looking_along, transform
+from wheretolook.geometry.views import Views
+from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.landmarks import Landmarks
-from wheretolook.planning.config import MAX_DIRECTIONS
-from wheretolook.planning.rrt import Space
+from wheretolook.planning.config import FORWARD, MAX_DIRECTIONS, PlanConfig
+from wheretolook.planning.routes import PlannedPath
+from wheretolook.planning.rrt import Space, check_ends, plan_path
+from wheretolook.planning.stops import check_stopping, stops_along, within_pitch
 from wheretolook.planning.viewpoint_map import MapOrigin, ViewpointMap
+from wheretolook.rendering.warp_renderer import Renderer
 from wheretolook.scorers.base import Scorer
 from wheretolook.scorers.registry import FALLBACK, is_probability, make_scorer, methods_named, scorers
-from wheretolook.scorers.weights import load_scorer
+from wheretolook.scorers.weights import load_scorer, resolve_weights
 from wheretolook.utils.errors import ConfigError, SceneError, check_range
 from wheretolook.visibility.counting import SurveyOptions, survey
 
@@ -217,3 +223,69 @@ def fill_partially_free_voxels(viewpoint_map: ViewpointMap, space: Space) -> Vie
             if clear.any():
                 rows[voxel] = viewpoint_map.row_of_voxel[near[int(np.argmax(clear))]]
     return replace(viewpoint_map, row_of_voxel=rows, origin=viewpoint_map.origin.derive("views borrowed by neighbours"))
+
+
+def plan_by_methods(
+    scene: Environment,
+    dataset: Dataset | None,
+    methods: Iterable[str],
+    start: ArrayLike,
+    goal: ArrayLike,
+    config: PlanConfig = PlanConfig(),
+) -> dict[str, PlannedPath]:
+    """Plan a path from start to goal, (3,) in the map's own frame, by each method, with progress bars.
+
+    Returned paths are in the world: metres, z up. A method plans by its own viewpoint map, whose scores are of views from the centres of voxels. The scores of the
+    returned path are of its exact poses, in the scorer's units; NaN for "forward". Its cost is still the planner's. If
+    `config.stops` asks for them, paths get stops (`stops_along`) where the method's scores are probabilities; the last
+    method's must be.
+
+    Methods are "forward", or names of scorers; empty for that of the weights, or bins without. `config` has weights for
+    learned methods, if they are of their kind (`resolve_weights`); without them they are the dataset's or the bundled
+    ones. Returns paths by the names of their methods, in
+    the order given. Raises ConfigError if a method needs weights or there is none of that name, or the last cannot
+    stop; PlanningError if no path can be found.
+    """
+    methods = tuple(methods)
+    space = scene.space
+    check_methods(methods)
+    stopping = config.stops.looks > 1
+    if stopping and methods and methods[-1]:
+        check_stopping(methods[-1])
+    world_from_map = scene.frame.world_from_map
+    start, goal = ends = world_from_map.apply(np.array([start, goal], dtype=np.float64))
+    check_ends(ends, space, space.bounds, world_from_map.inverse)  # before maps are built
+    paths: dict[str, PlannedPath] = {}
+    for number, method in enumerate(methods, 1):
+        if method == FORWARD:
+            name = method
+            path = plan_path(start, goal, space, space.bounds, None, config.planner)
+        else:
+            weights = resolve_weights(method, config.weights, dataset=dataset)
+            accuracy = config.accuracy if number == len(methods) else None
+            scorer = scene_scorer(scene, method, weights, config.anywhere, accuracy)
+            views = planner_map(scene, config, scorer)
+            name = method or scorer.name
+            path = plan_path(start, goal, space, space.bounds, views, config.planner)
+            path = replace(path, scores=scorer.score(poses_looking_along(path.positions, path.axes)))
+            if stopping and (is_probability(scorer.name) or number == len(methods)):
+                axes = within_pitch(views.directions, config.planner)
+                stops = stops_along(
+                    scorer, path.positions, path.axes, axes, config.stops, config.planner, progress="stops"
+                )
+                path = replace(path, stops=stops)
+        paths.pop(name, None)  # a method named twice comes where it was named last
+        paths[name] = path
+    return paths
+
+
+def path_views(path: PlannedPath, localization_map: LocalizationMap, renderer: Renderer | None = None) -> Views:
+    """Return `PlannedPath.views` with the camera, the pixels of the landmarks in view, and images if there is a renderer."""
+    views = path.views
+    camera = localization_map.camera
+    points = localization_map.landmarks.points
+    pixels = []
+    for pose, rows in zip(views.cam_from_world, localization_map.landmarks_in_view(views.cam_from_world), strict=True):
+        pixels.append(camera.project(transform(pose, points[rows])))
+    images = None if renderer is None else renderer.render(camera, views.cam_from_world).rgb
+    return replace(views, camera=camera, pixels=tuple(pixels), images=images)

@@ -10,8 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.special import expit
 from tqdm.auto import tqdm
 
-from wheretolook.geometry.camera_turns import angles_to_axis_deg
-from wheretolook.geometry.poses import Float, poses_looking_along
+from wheretolook.geometry.poses import Float, angles_to_axis_deg, poses_looking_along
 from wheretolook.geometry.views import Views
 from wheretolook.looks.selection import (
     CANDIDATES,

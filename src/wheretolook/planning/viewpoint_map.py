@@ -12,9 +12,15 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from wheretolook.geometry.camera_turns import angles_to_axis_deg, check_axis, turns_from_deg, within
 from wheretolook.geometry.lattices import VoxelGrid
-from wheretolook.geometry.poses import Float, rotation_looking_along
+from wheretolook.geometry.poses import (
+    Float,
+    angles_to_axis_deg,
+    check_axis,
+    rotation_looking_along,
+    turns_from_deg,
+    within,
+)
 from wheretolook.geometry.views import Views
 from wheretolook.looks.selection import best_views
 from wheretolook.utils.errors import ConfigError, MapFormatError

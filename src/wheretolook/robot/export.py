@@ -163,7 +163,7 @@ def set_graph(trained: TrainedNetwork[SetNetwork], accuracy: Accuracy) -> Any:
 
 
 PACKAGE = "wheretolook_localization"  # of the copies, so that an installed wheretolook does not replace them
-FIRST = "wheretolook.robot.localizer", "wheretolook.planning.view_sequence"
+FIRST = "wheretolook.robot.localizer", "wheretolook.planning.routes"
 ROOT = Path(wheretolook.__file__).parent
 
 

@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 
 from wheretolook.dataset.config import CONTRADICTED, LOCALIZED, NO_POSE
 from wheretolook.geometry.camera import Camera, PinholeCamera, camera_of, cameras_by_id, describe_camera
-from wheretolook.geometry.camera_turns import pan_tilt_angles
 from wheretolook.geometry.pose_files import images_text
-from wheretolook.geometry.poses import Float, camera_centers, quaternion_from_rotation
+from wheretolook.geometry.poses import Float, camera_centers, pan_tilt_angles, quaternion_from_rotation
 from wheretolook.localization.rig_localization import JointLocalization
 from wheretolook.mapping.colmap_model import camera_of_model, registered_names
 from wheretolook.mapping.map_frame import IDENTITY, MapFrame

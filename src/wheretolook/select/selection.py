@@ -8,15 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
-from wheretolook.geometry.camera_turns import pan_tilt_angles
-from wheretolook.geometry.poses import Float, poses_looking_along
+from wheretolook.geometry.poses import Float, pan_tilt_angles, poses_looking_along
 from wheretolook.geometry.views import Views
 from wheretolook.inputs.landmark_features import ReasonCounter
 from wheretolook.looks.selection import best_views, separated
 from wheretolook.planning.config import StopConfig
-from wheretolook.planning.routes import PlannedPath
+from wheretolook.planning.routes import PlannedPath, TurnLimit, best_sequence
 from wheretolook.planning.stops import stops_along
-from wheretolook.planning.view_sequence import TurnLimit, best_sequence
 from wheretolook.scorers.base import Scorer
 from wheretolook.select.waypoints import SelectionRequest, Waypoints, usable_waypoints
 from wheretolook.utils.errors import ConfigError

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from wheretolook.geometry.camera_turns import pan_tilt_angles
 from wheretolook.geometry.lattices import VoxelGrid
 from wheretolook.geometry.pose_files import (
     QUATERNION_COLUMNS,
@@ -20,7 +19,13 @@ from wheretolook.geometry.pose_files import (
     poses_of_rows,
     read_named_rows,
 )
-from wheretolook.geometry.poses import Float, camera_centers, quaternion_from_rotation, rotation_from_quaternion
+from wheretolook.geometry.poses import (
+    Float,
+    camera_centers,
+    pan_tilt_angles,
+    quaternion_from_rotation,
+    rotation_from_quaternion,
+)
 from wheretolook.looks.selection import MAX_VIEWS
 from wheretolook.utils.errors import ConfigError, SceneError, TableError, check_limits, check_pitch, check_range, reject
 

@@ -11,8 +11,7 @@ import numpy as np
 import pandas as pd
 
 from wheretolook.dataset.config import ALL, threshold_key, threshold_label
-from wheretolook.geometry.camera_turns import pan_tilt_angles
-from wheretolook.geometry.poses import camera_centers
+from wheretolook.geometry.poses import camera_centers, pan_tilt_angles
 from wheretolook.utils.files import write_text
 from wheretolook.utils.texts import markdown_table
 from wheretolook_paper.benchmark.scores import PLAN, PLAN_THRESHOLD, PLAN_TURN_DEG, Scores

@@ -18,7 +18,7 @@ from wheretolook.commands.options import (
 )
 from wheretolook.dataset.dataset_lock import reading
 from wheretolook.dataset.layout import Dataset
-from wheretolook.tracking.store import TrackingConfig, check_store, kept_if_not_logged
+from wheretolook.tracking import TrackingConfig, check_store, kept_if_not_logged
 from wheretolook.utils.errors import ConfigError, SceneError
 from wheretolook.utils.files import atomic_write, write_text
 from wheretolook_paper.paths.config import PathsConfig
@@ -115,7 +115,7 @@ def _report(
     paths: pd.DataFrame, views: pd.DataFrame, dataset: Dataset, config: PathsConfig, tracking: TrackingConfig, log: Log
 ) -> pd.DataFrame:
     """Summarize the localized views, write tables and figure, and log them."""
-    from wheretolook.figures.style import save_figure
+    from wheretolook.figures.floor_plan import save_figure
     from wheretolook_paper.figures.paths import paths_figure
     from wheretolook_paper.paths import path_report as report
 

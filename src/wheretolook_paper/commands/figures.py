@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 from wheretolook.commands.options import DatasetOptions, Log
 from wheretolook.dataset.dataset_lock import reads_dataset
-from wheretolook.tracking.store import TrackingConfig
+from wheretolook.tracking import TrackingConfig
 from wheretolook.utils.errors import MissingRunError
 from wheretolook_paper.figures.config import FiguresConfig
 

@@ -12,7 +12,7 @@ from matplotlib.style import context
 from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
-from wheretolook.figures.style import BLUE, GREEN, RC, VERMILION, Style, frame, new_figure
+from wheretolook.figures.floor_plan import BLUE, RC, VERMILION, frame, new_figure
 from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.poses import camera_centers
 from wheretolook.planning.config import FORWARD
@@ -23,6 +23,7 @@ from wheretolook.view.state import RecordedPath, ViewState
 from wheretolook.view.viewed_map import ViewedMap
 from wheretolook_paper.figures.animation import pixels_of, save_moving
 from wheretolook_paper.figures.dollhouse import Dollhouse, dollhouse, draw_house, draw_segments
+from wheretolook_paper.figures.style import GREEN, Style
 
 FRAME_MS = 220
 LAST_MS = 2500  # the last frame

@@ -19,7 +19,7 @@ from wheretolook.commands.options import (
 )
 from wheretolook.dataset.dataset_lock import reading
 from wheretolook.dataset.layout import Dataset, SceneFolder
-from wheretolook.tracking.store import TrackingConfig, check_store, kept_if_not_logged
+from wheretolook.tracking import TrackingConfig, check_store, kept_if_not_logged
 from wheretolook.utils.errors import ConfigError, SceneError, check_choice, check_range
 from wheretolook.utils.files import atomic_write, fingerprint, write_text
 
@@ -168,7 +168,7 @@ class Relocalize(SceneOptions):
 
     def _log(self, dataset: Dataset, summary: pd.DataFrame, results: Path) -> None:
         """Log the comparison as a run with its files, and a nested run for each policy."""
-        from wheretolook.tracking.runs import BEST_TAG, NestedRun, log, log_nested, start_run
+        from wheretolook.tracking import BEST_TAG, NestedRun, log, log_nested, start_run
 
         params = {"dataset": dataset.name, "places": self.places, "views": self.views, "method": self.method}
         params |= {"confidence": self.confidence, "seed": self.seed}

@@ -12,7 +12,7 @@ import pandas as pd
 from wheretolook.dataset.layout import Dataset, SceneFolder
 from wheretolook.dataset.viewpoint_files import has_matches, read_table
 from wheretolook.dataset.viewpoint_table import is_good, poses
-from wheretolook.tracking.store import kept_if_not_logged
+from wheretolook.tracking import kept_if_not_logged
 from wheretolook.utils.files import write_text
 from wheretolook_paper.evaluation.looks import LOOKS_CSV, LOOKS_MD, NUMBERS, STRATEGIES, log_looks, write_looks
 
@@ -22,14 +22,14 @@ if TYPE_CHECKING:
     from wheretolook.geometry.poses import Float
     from wheretolook.geometry.views import Views
     from wheretolook.scorers.base import Scorer
-    from wheretolook.tracking.store import TrackingConfig
+    from wheretolook.tracking import TrackingConfig
 
 LEVEL_DEG = 25.0  # pitch at most of a camera held level
 
 
 def report_labels(folder: Path, views: pd.DataFrame, title: str) -> tuple[Path, ...]:
     """Write `labels.md` and `labels.png` of a dataset's `pooled_labels`; return their paths."""
-    from wheretolook.figures.style import save_figure
+    from wheretolook.figures.floor_plan import save_figure
     from wheretolook_paper.evaluation.label_report import label_markdown, label_summary
     from wheretolook_paper.figures.labels import label_figure
 
@@ -46,7 +46,7 @@ def report_scores(folder: Path, table: pd.DataFrame, calibration: pd.DataFrame, 
     `occlusion.png`; those of an earlier evaluation are removed. Returns the text of `scores.md`.
     """
     from wheretolook.evaluation.results import SCORES_MD, SCORES_PNG, VARIANTS_CSV, main_rows, read_scores
-    from wheretolook.figures.style import save_figure
+    from wheretolook.figures.floor_plan import save_figure
     from wheretolook_paper.evaluation.paper_tables import write_paper_tables
     from wheretolook_paper.evaluation.score_report import score_markdown
     from wheretolook_paper.figures.calibration import calibration_figure
@@ -83,7 +83,7 @@ def draw_path(views: dict[str, Views], landmarks: Float, title: str, folder: Pat
         folder: where the files are written.
         film: suffix of a film of the path, gif or mp4; none for no film.
     """
-    from wheretolook.figures.style import save_figure
+    from wheretolook.figures.floor_plan import save_figure
     from wheretolook_paper.figures.animation import save_moving
     from wheretolook_paper.figures.path_film import FRAME_MS, film_frames, methods_figure, still_figure
 
@@ -109,7 +109,7 @@ def draw_overview(options: Demo, weights: Path) -> None:
     """
     from wheretolook.commands.demo import OVERVIEW
     from wheretolook.commands.options import open_scene
-    from wheretolook.figures.style import save_figure, scene_label
+    from wheretolook.figures.floor_plan import save_figure
     from wheretolook.geometry.poses import camera_centers, poses_looking_along
     from wheretolook.scorers.weights import load_scorer
     from wheretolook_paper.figures.dollhouse import dollhouse
@@ -121,6 +121,7 @@ def draw_overview(options: Demo, weights: Path) -> None:
         rendered_views,
         shares_good,
     )
+    from wheretolook_paper.figures.style import scene_label
     from wheretolook_paper.styles import method_style
 
     scene = open_scene(options, Dataset.load(options.root).scenes[-1])

@@ -10,8 +10,7 @@ import numpy as np
 import pandas as pd
 
 from wheretolook.evaluation.statistics import ClusterBootstrap
-from wheretolook.tracking.runs import BEST_TAG
-from wheretolook.tracking.store import TrackingConfig
+from wheretolook.tracking import BEST_TAG, TrackingConfig
 from wheretolook.utils.files import write_text
 from wheretolook.utils.texts import markdown_table
 
@@ -120,7 +119,7 @@ def log_looks(
 
     The run has the metrics of the best strategy for the largest sets.
     """
-    from wheretolook.tracking.runs import NestedRun, log, log_nested, start_run
+    from wheretolook.tracking import NestedRun, log, log_nested, start_run
 
     numbers = [name for name in _NUMBERS if name in table]
     best = table[table["n_looks"] == table["n_looks"].max()].nlargest(1, "good").iloc[0]

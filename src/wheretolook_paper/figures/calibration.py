@@ -8,7 +8,8 @@ from matplotlib.figure import Figure
 from matplotlib.style import context
 
 from wheretolook.evaluation.results import main_rows, methods_of
-from wheretolook.figures.style import GREY, INK, RC, Style, new_figure
+from wheretolook.figures.floor_plan import GREY, INK, RC, new_figure
+from wheretolook_paper.figures.style import Style
 from wheretolook_paper.styles import method_style
 
 

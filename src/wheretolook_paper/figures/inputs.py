@@ -12,9 +12,10 @@ from matplotlib.figure import Figure
 from matplotlib.style import context
 from numpy.typing import NDArray
 
-from wheretolook.figures.style import ORANGE, PRINT, TWO_COLUMNS_IN, frame, new_figure
+from wheretolook.figures.floor_plan import frame, new_figure
 from wheretolook.geometry.poses import Float
 from wheretolook.inputs.channels import PAPER_VARIANTS
+from wheretolook_paper.figures.style import ORANGE, PRINT, TWO_COLUMNS_IN
 
 UNITS = {"u": "px", "v": "px", "x": "m", "y": "m", "z": "m"}
 

@@ -8,9 +8,10 @@ from matplotlib.figure import Figure
 from matplotlib.style import context
 from scipy.spatial import ConvexHull, cKDTree
 
-from wheretolook.figures.style import BLUE, GREEN, GRID, INK, RC, VERMILION, new_figure
+from wheretolook.figures.floor_plan import BLUE, INK, RC, VERMILION, new_figure
 from wheretolook.geometry.lattices import azimuth_elevation_lattice, fibonacci_sphere, released_lattice
 from wheretolook.geometry.poses import Float
+from wheretolook_paper.figures.style import GREEN, GRID
 
 
 def covering_radius_deg(directions: Float) -> float:

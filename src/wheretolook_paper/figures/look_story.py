@@ -13,7 +13,7 @@ from matplotlib.style import context
 from numpy.typing import ArrayLike
 
 from wheretolook.dataset.config import THRESHOLDS
-from wheretolook.figures.style import BLUE, GREEN, RC, VERMILION, Style, new_figure
+from wheretolook.figures.floor_plan import BLUE, RC, VERMILION, new_figure
 from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.poses import Float, pose_error
 from wheretolook.localization.confidence import ConfidenceModel
@@ -24,6 +24,7 @@ from wheretolook.utils.errors import PoseError
 from wheretolook.view.drawing import frustum_segments
 from wheretolook_paper.figures.animation import Pixels, pixels_of
 from wheretolook_paper.figures.dollhouse import Dollhouse, draw_house, draw_segments
+from wheretolook_paper.figures.style import GREEN, Style
 
 MAX_ERROR_M, MAX_ERROR_DEG = THRESHOLDS[0]
 FRAME_MS = 2200

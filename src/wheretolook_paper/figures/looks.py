@@ -9,8 +9,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.style import context
 
-from wheretolook.figures.style import BLUE, GREEN, GREY, INK, ORANGE, PURPLE, RC, SKY, VERMILION, new_figure
+from wheretolook.figures.floor_plan import BLUE, GREY, INK, RC, VERMILION, new_figure
 from wheretolook_paper.evaluation.looks import TOGETHER
+from wheretolook_paper.figures.style import GREEN, ORANGE, PURPLE, SKY
 
 _STYLES: dict[str, tuple[str, str, str]] = {
     TOGETHER: ("chosen jointly", BLUE, "o"),

@@ -12,9 +12,10 @@ from matplotlib.figure import Figure
 from matplotlib.patches import ConnectionPatch
 from matplotlib.style import context
 
-from wheretolook.figures.style import BLUE, INK, PRINT, TWO_COLUMNS_IN, VERMILION, Style, frame, new_figure
+from wheretolook.figures.floor_plan import BLUE, INK, VERMILION, frame, new_figure
 from wheretolook.geometry.poses import Float
 from wheretolook_paper.figures.inputs import BinnedImage, draw_counts, draw_landmarks
+from wheretolook_paper.figures.style import PRINT, TWO_COLUMNS_IN, Style
 
 _COLUMNS = 12  # of a hidden layer's values
 _WIDE = 10  # letters below the score

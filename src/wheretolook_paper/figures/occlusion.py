@@ -13,7 +13,7 @@ from matplotlib.style import context
 
 from wheretolook.dataset.config import ALL, threshold_label
 from wheretolook.evaluation.results import ORACLE, is_random, main_rows, methods_of, threshold_keys
-from wheretolook.figures.style import INK, RC, new_figure
+from wheretolook.figures.floor_plan import INK, RC, new_figure
 from wheretolook_paper.figures.scores import methods_to_show
 from wheretolook_paper.styles import method_style
 

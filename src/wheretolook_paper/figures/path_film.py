@@ -10,12 +10,13 @@ from matplotlib.figure import Figure
 from matplotlib.style import context
 from numpy.typing import NDArray
 
-from wheretolook.figures.style import INK, RC, Style, frame, new_figure
+from wheretolook.figures.floor_plan import INK, RC, frame, new_figure
 from wheretolook.geometry.poses import Float
 from wheretolook.geometry.views import Views
-from wheretolook.planning.view_sequence import lengths_along
+from wheretolook.planning.routes import lengths_along
 from wheretolook.utils.texts import counted, score_text
 from wheretolook_paper.figures.animation import Pixels, pixels_of
+from wheretolook_paper.figures.style import Style
 from wheretolook_paper.styles import method_style
 
 PATH = "#CC3311"

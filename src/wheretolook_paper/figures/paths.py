@@ -10,7 +10,8 @@ from matplotlib.figure import Figure
 from matplotlib.style import context
 
 from wheretolook.dataset.config import ALL
-from wheretolook.figures.style import INK, RC, Style, new_figure, scene_label
+from wheretolook.figures.floor_plan import INK, RC, new_figure
+from wheretolook_paper.figures.style import Style, scene_label
 from wheretolook_paper.styles import method_style
 
 FILLED = {"greedy": "full", "with stops": "left"}

@@ -13,13 +13,14 @@ from matplotlib.style import context
 from numpy.typing import NDArray
 
 from wheretolook.dataset.layout import Dataset
-from wheretolook.figures.style import BLUE, GREY, RC, VERMILION, frame, new_figure, scene_label
+from wheretolook.figures.floor_plan import BLUE, GREY, RC, VERMILION, frame, new_figure
 from wheretolook.geometry.poses import Float, poses_looking_along
 from wheretolook.geometry.views import Views
-from wheretolook.planning.view_sequence import lengths_along
+from wheretolook.planning.routes import lengths_along
 from wheretolook.utils.errors import MissingRunError
 from wheretolook.utils.texts import markdown_table
 from wheretolook_paper.figures.path_film import PATH, draw_path
+from wheretolook_paper.figures.style import scene_label
 from wheretolook_paper.styles import method_style
 
 PATHS_CSV = "plan_photographs.csv"

@@ -14,11 +14,11 @@ from matplotlib.patches import Patch, Rectangle
 from matplotlib.style import context
 from numpy.typing import NDArray
 
-from wheretolook.figures.style import BLUE, INK, ORANGE, PRINT, SKY, TWO_COLUMNS_IN, VERMILION, Style, new_figure
-from wheretolook.geometry.camera_turns import pan_tilt_angles
+from wheretolook.figures.floor_plan import BLUE, INK, VERMILION, new_figure
 from wheretolook.geometry.lattices import VoxelGrid
-from wheretolook.geometry.poses import Float
+from wheretolook.geometry.poses import Float, pan_tilt_angles
 from wheretolook_paper.figures.dollhouse import Dollhouse, draw_house, draw_points, draw_segments
+from wheretolook_paper.figures.style import ORANGE, PRINT, SKY, TWO_COLUMNS_IN, Style
 
 _SIGHT_LINES = 120
 _MARGIN_PX = 0.04

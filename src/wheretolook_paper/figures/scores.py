@@ -15,8 +15,9 @@ from matplotlib.ticker import MaxNLocator
 
 from wheretolook.dataset.config import ALL, threshold_label
 from wheretolook.evaluation.results import ORACLE, is_random, main_rows, reference_of, threshold_keys
-from wheretolook.figures.style import INK, RC, Style, new_figure
+from wheretolook.figures.floor_plan import INK, RC, new_figure
 from wheretolook.geometry.poses import Float
+from wheretolook_paper.figures.style import Style
 from wheretolook_paper.styles import method_group, method_style
 
 _MAX_METHODS = {"Fisher": 3, "probes": 0}  # the best methods of a group that a figure shows; all of other groups

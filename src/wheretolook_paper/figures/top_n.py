@@ -13,9 +13,10 @@ from matplotlib.style import context
 
 from wheretolook.dataset.config import ALL, threshold_label
 from wheretolook.evaluation.results import ORACLE, main_rows, methods_of, threshold_keys
-from wheretolook.figures.style import GREY, PRINT, TWO_COLUMNS_IN, Style, new_figure
+from wheretolook.figures.floor_plan import GREY, new_figure
 from wheretolook.scorers.registry import find
 from wheretolook_paper.evaluation.paper_tables import PAPER
+from wheretolook_paper.figures.style import PRINT, TWO_COLUMNS_IN, Style
 from wheretolook_paper.styles import STYLES, method_style
 
 ROWS = {

@@ -8,7 +8,8 @@ import pandas as pd
 from matplotlib.figure import Figure
 from matplotlib.style import context
 
-from wheretolook.figures.style import RC, Style, new_figure
+from wheretolook.figures.floor_plan import RC, new_figure
+from wheretolook_paper.figures.style import Style
 from wheretolook_paper.styles import method_style
 
 

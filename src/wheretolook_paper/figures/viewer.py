@@ -8,12 +8,13 @@ import numpy as np
 import open3d as o3d
 from matplotlib.colors import to_rgb
 
-from wheretolook.figures.style import BLUE, ORANGE
+from wheretolook.figures.floor_plan import BLUE
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.mesh import TexturedMesh
 from wheretolook.geometry.poses import Float
 from wheretolook.scenes.cutting import cut_above
 from wheretolook.view.drawing import frustum_segments
+from wheretolook_paper.figures.style import ORANGE
 
 FRUSTUM_M = 0.25  # depth of the cameras that are drawn
 

@@ -13,12 +13,13 @@ from wheretolook.dataset.config import ALL
 from wheretolook.dataset.viewpoint_table import LOCALIZED
 from wheretolook.evaluation.statistics import ClusterBootstrap, divide
 from wheretolook.planning.config import FORWARD
-from wheretolook.tracking.runs import (
+from wheretolook.tracking import (
     ALL_METHODS,
     BEST_TAG,
     FINGERPRINT_TAG,
     NestedRun,
     Tags,
+    TrackingConfig,
     fingerprint_of,
     joined,
     log,
@@ -26,7 +27,6 @@ from wheretolook.tracking.runs import (
     logged_last,
     start_run,
 )
-from wheretolook.tracking.store import TrackingConfig
 from wheretolook.utils.texts import markdown_table
 from wheretolook_paper.paths.config import PathsConfig
 

@@ -6,9 +6,8 @@ from pathlib import Path
 
 import pandas as pd
 
-from wheretolook.figures.style import save_figure
-from wheretolook.tracking.runs import Tags, log, start_run
-from wheretolook.tracking.store import TrackingConfig
+from wheretolook.figures.floor_plan import save_figure
+from wheretolook.tracking import Tags, TrackingConfig, log, start_run
 from wheretolook.utils.files import copy_file, temporary_folder
 from wheretolook_paper.figures.runtimes import runtime_figure, scaling_figure
 

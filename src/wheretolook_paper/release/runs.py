@@ -20,12 +20,13 @@ from wheretolook.dataset.layout import Dataset
 from wheretolook.dataset.viewpoint_table import UNLABELLED, is_good
 from wheretolook.evaluation.results import SCORES_CSV, best_of, evaluation_params, read_scores, runs_of_rows
 from wheretolook.scorers.registry import learned
-from wheretolook.tracking.runs import (
+from wheretolook.tracking import (
     ALL_METHODS,
     AUC,
     BEST_TAG,
     REGRET,
     NestedRun,
+    TrackingConfig,
     artifact,
     experiment_ids,
     finished_runs,
@@ -35,8 +36,7 @@ from wheretolook.tracking.runs import (
     log_nested,
     start_run,
 )
-from wheretolook.tracking.store import TrackingConfig
-from wheretolook.tracking.store import client as client_of
+from wheretolook.tracking import client as client_of
 from wheretolook.training.provenance import HISTORY_CSV, kept_metrics, params_of
 from wheretolook.utils.files import temporary_folder, write_text
 from wheretolook.utils.processes import hold

@@ -16,7 +16,7 @@ from wheretolook.geometry.poses import Float, poses_looking_along, rotation_look
 from wheretolook.geometry.views import Views
 from wheretolook.inputs.channels import CHANNELS
 from wheretolook.planning.config import PlanConfig
-from wheretolook.planning.method_paths import path_views, plan_by_methods
+from wheretolook.planning.scene_map import path_views, plan_by_methods
 from wheretolook.scorers.base import Scorer
 from wheretolook.scorers.mlp.network import BinnedNetworkScorer
 from wheretolook.visibility.counting import Survey, SurveyOptions, survey

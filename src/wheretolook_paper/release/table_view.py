@@ -8,8 +8,7 @@ import pandas as pd
 
 from wheretolook.dataset.config import threshold_label
 from wheretolook.evaluation.results import RELEASED_DIVISOR
-from wheretolook.tracking.runs import newest_artifact
-from wheretolook.tracking.store import TrackingConfig
+from wheretolook.tracking import TrackingConfig, newest_artifact
 from wheretolook_paper.evaluation.paper_tables import KEYS
 
 if TYPE_CHECKING:

@@ -230,7 +230,7 @@ def draw(tables: list[Path], figure: Path, accuracy: str = "5 cm, 0.4 deg") -> N
     """Draw precision over coverage of the poses in tables of `main`: a panel for each set and features."""
     import matplotlib.pyplot as plt
 
-    from wheretolook.figures.style import save_figure
+    from wheretolook.figures.floor_plan import save_figure
 
     table = pd.concat([pd.read_csv(path) for path in tables], ignore_index=True)
     limit_m, limit_deg = ACCURACIES[accuracy]

@@ -17,8 +17,7 @@ from wheretolook.geometry.poses import pose_error
 from wheretolook.localization.confidence import ConfidenceModel, confidence_features
 from wheretolook.localization.estimation import PoseEstimator
 from wheretolook.mapping.landmarks import Landmarks
-from wheretolook.tracking.runs import newest_run
-from wheretolook.tracking.store import TrackingConfig
+from wheretolook.tracking import TrackingConfig, newest_run
 from wheretolook.utils.errors import ConfigError, PoseError, TableError
 from wheretolook_paper.commands.reports import LookConfig, evaluate_look_sets
 from wheretolook_paper.evaluation.joint_labels import SET_COLUMNS, label_sets

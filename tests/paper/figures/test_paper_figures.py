@@ -10,7 +10,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from box_scenes import furnished_room
-from wheretolook.figures.style import save_figure
+from wheretolook.figures.floor_plan import save_figure
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.lattices import fibonacci_sphere, released_lattice
 from wheretolook.geometry.poses import poses_looking_along

@@ -12,7 +12,7 @@ from holdout.rendered_room import write_rendered_room
 from wheretolook.geometry.poses import camera_centers, poses_looking_along
 from wheretolook.holdout.photo_map import features_of, open_map
 from wheretolook.mapping.config import FrameOptions
-from wheretolook.space.mapped_space import MappedSpace
+from wheretolook.space.free_space import MappedSpace
 from wheretolook.utils.errors import PlanningError
 from wheretolook_paper.figures.photograph_paths import AXIS, LANDMARKS_CSV, PATHS_CSV, POSITION
 from wheretolook_paper.studies.plan_photographs import farthest_ends, main, nearest_photographs, write_rows

@@ -15,8 +15,7 @@ from wheretolook.commands.label import log_labels
 from wheretolook.commands.train import train_methods
 from wheretolook.dataset.layout import Dataset
 from wheretolook.evaluation.config import EvaluateConfig
-from wheretolook.tracking.runs import artifact, finished_runs
-from wheretolook.tracking.store import TrackingConfig, client
+from wheretolook.tracking import TrackingConfig, artifact, client, finished_runs
 from wheretolook.training.fit import EpochRecord
 from wheretolook.utils.errors import TrackingError, TrackingWarning
 from wheretolook.utils.files import sha256

@@ -20,12 +20,12 @@ LINK = re.compile(r"(?<=\]\()(?![a-z]+:|[#/])([^)\s#]+)")
 
 
 def _place(uri: str) -> str:
-    """Where a file of the repository, such as docs/stages.md, lies in the site's sources: stages.md."""
+    """Return the path of a file of the repository, such as docs/stages.md, in the site's sources: stages.md."""
     return "index.md" if uri == "README.md" else uri.removeprefix("docs/")
 
 
 def _taken(uri: str, config: MkDocsConfig) -> File:
-    """A file of the repository outside docs/ as a file of the site."""
+    """Return a file of the repository outside docs/ as a file of the site."""
     return File(uri, str(ROOT), config.site_dir, config.use_directory_urls)
 
 

@@ -3,21 +3,25 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 from wheretolook.commands.demo import Demo
+from wheretolook.commands.map import Map
 from wheretolook.commands.options import select_options
 from wheretolook.planning.config import PlanConfig, ViewpointMapConfig
 
 
 @dataclass(frozen=True, kw_only=True)
 class AllOptions(Demo):
-    """Options of every command that works on a dataset."""
+    """Options of every command that works on a dataset; `source` has those of `Map` that others would take for theirs."""
 
     viewpoint_map: ViewpointMapConfig = field(default_factory=ViewpointMapConfig)
     plan: PlanConfig = field(default_factory=PlanConfig)
     release_name: str = "release"
+    source: dict[str, Any] = field(default_factory=dict)
 
 
 def run(command, options, log=lambda line: None):
     """Run a command with those of the options that it has."""
-    return select_options(command, options).run(log)
+    given = options.source if command is Map else {}
+    return select_options(command, options, **given).run(log)

@@ -50,7 +50,9 @@ def test_arguments_override_the_file() -> None:
     [
         ("scenes", ["--scenes.meshes", "[{path: a/b.glb, up: y}]"], "scenes.meshes", (MeshSource(Path("a/b.glb"), up="y"),)),
         ("map", ["--mapping.camera.fov_deg", "60"], "mapping.camera.fov_deg", 60.0),
-        ("map", ["--up", "-y", "--model", "a"], "mapping.frame.up", "-y"),
+        ("map", ["--up", "-y", "--model", "a"], "up", "-y"),
+        ("map", ["--mapping.existing.model", "a", "--mapping.frame.up", "-y"], "up", "-y"),
+        ("plan", ["--plan.start", "[-4, -3, 1.4]", "--plan.stops.looks", "3"], "plan.stops.looks", 3),
         ("plan", ["--start", "[-4, -3, 1.4]"], "plan.start", (-4.0, -3.0, 1.4)),
         ("plan", ["--start", "-4,-3,1.4"], "plan.start", (-4.0, -3.0, 1.4)),
         ("plan", ["--goal", "0", "-3", "1.4"], "plan.goal", (0.0, -3.0, 1.4)),
@@ -97,7 +99,7 @@ def test_python_and_the_command_line_mean_the_same() -> None:
         ["scenes", "--camera.width", "0"],
         ["scenes", "--config", str(CONFIGS / "own-meshes.yaml")],  # no scene
         ["demo", "--config", str(CONFIGS / "own-meshes.yaml"), "--scenes.meshes", "[{path: a/b.glb}]"],  # no weights
-        ["sample", "--sample.lattice", "spiral"],
+        ["viewpoint-map", "--lattice", "spiral"],
         ["plan", "--start", "[.nan, 1, 1]"],
         ["plan", "--plan.planner.time_s", ".inf"],
         ["select", "--map", "m", "--out", "o.csv"],

@@ -8,16 +8,18 @@ import shutil
 import subprocess
 import sys
 import tomllib
+from collections.abc import Iterator
 from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
+import yaml
 
 from box_scenes import furnished_room
 from selection.room import write_room
-from wheretolook.cli import main, parse_command
+from wheretolook.cli import command_options, command_targets, load_command, main, parse_command
 from wheretolook.dataset.layout import Dataset
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.mapping.colmap_model import colmap_poses
@@ -164,12 +166,13 @@ NUMBERS = Numbers(ROOT)
 @pytest.mark.parametrize("page", pages(NUMBERS))
 def test_numbers_are_those_of_the_results(page: str) -> None:
     assert (ROOT / page).read_text() == updated(page, NUMBERS), (
-        "python -m wheretolook_paper.studies.results --only pages"
+        "python -m wheretolook_paper.studies.results --only '[pages]'"
     )
 
 
 def test_a_changed_result_changes_the_page(tmp_path: Path) -> None:
     shutil.copytree(ROOT / "data" / "release" / "results", tmp_path / "data" / "release" / "results")
+    shutil.copy(ROOT / "data" / "release" / "README.md", tmp_path / "data" / "release")
     shutil.copytree(ROOT / "docs", tmp_path / "docs")
     path = tmp_path / "data" / "release" / "results" / "looks.csv"
     table = pd.read_csv(path)
@@ -188,3 +191,33 @@ def test_the_table_of_paths_on_photographs_is_that_of_the_release() -> None:
     missing = [cells for cells in made if cells not in page and set(cells[1]) != {"-"}]
     assert len(made) == 8 and not missing
     assert set(landmarks["scene"]) == set(table["scene"])
+
+
+# --- options
+
+
+def test_options_are_few_and_each_is_in_a_page_configuration_or_notebook() -> None:
+    sources = [*PAGES, *(ROOT / "docs" / "research").glob("*.md"), *(ROOT / "notebooks").glob("*.py")]
+    text = "\n".join(path.read_text() for path in sources)
+    configured = {
+        name for path in (ROOT / "configs").glob("*.yaml") for name in dotted(yaml.safe_load(path.read_text()))
+    }
+    options: dict[str, set[str]] = {}
+    for command in map(load_command, command_targets()):
+        for name in command_options(command):
+            options.setdefault(name, {name}).update(short for short, full in command.SHORT.items() if full == name)
+    missing = []
+    for option, names in options.items():
+        written = [rf"--{re.escape(name).replace('_', '[-_]')}(?![\w.-])" for name in names]
+        written += [rf"(?<![\w.-]){re.escape(name)}(?!\w)" for name in names if "." in name]
+        if option not in configured and not re.search("|".join(written), text):
+            missing.append(option)
+    assert missing == [] and len(options) <= 180
+
+
+def dotted(settings: dict[str, object], prefix: str = "") -> Iterator[str]:
+    """Yield the dotted names of nested settings."""
+    for key, value in settings.items():
+        yield f"{prefix}{key}"
+        if isinstance(value, dict):
+            yield from dotted(value, f"{prefix}{key}.")

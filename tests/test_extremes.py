@@ -21,6 +21,7 @@ from wheretolook.geometry.lattices import VoxelGrid, fibonacci_sphere
 from wheretolook.geometry.poses import Float, poses_looking_along, rotation_looking_along
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.landmarks import Landmarks
+from wheretolook.mapping.map import Map
 from wheretolook.planning.config import ViewpointMapConfig
 from wheretolook.planning.scene_map import build_viewpoint_map
 from wheretolook.rendering.warp_renderer import WarpRenderer
@@ -63,7 +64,7 @@ def test_flat_and_tiny_maps_are_scored_by_every_method(name: str) -> None:
     poses = poses_looking_along(np.zeros((2, 3)), [(1.0, 0.0, 0.0), (-1.0, 0.0, 0.0)])
     known = poses_looking_along([(0.5, 0.5, 0.0)], FORWARD)
     for hides in (NoOcclusion(), HiddenPointRemoval()):
-        localization_map = LocalizationMap(landmarks, CAMERA, hides, mapping_poses=known)
+        localization_map = LocalizationMap(Map(landmarks, mapping_poses=known), CAMERA, hides)
         seen = np.diff(localization_map.landmarks_in_view(poses).starts)
         in_image = CAMERA.in_image(CAMERA.project(landmarks.points @ poses[0, :, :3].T))
         expected = in_image & (landmarks.points[:, 0] > 0)
@@ -81,7 +82,7 @@ def test_a_view_exactly_on_a_landmark() -> None:
     landmarks = room_landmarks(200)
     here = landmarks.points[17]
     poses = poses_looking_along(np.tile(here, (len(DIRECTIONS), 1)), DIRECTIONS)
-    localization_map = LocalizationMap(landmarks, CAMERA, NoOcclusion(), mapping_poses=poses[:3])
+    localization_map = LocalizationMap(Map(landmarks, mapping_poses=poses[:3]), CAMERA, NoOcclusion())
     seen = localization_map.landmarks_in_view(poses)
     assert not np.isin(17, seen.indices)  # it has no direction as seen from there
     rotations = poses[:, :, :3]
@@ -104,7 +105,7 @@ def test_images_of_one_pixel() -> None:
         assert image.rgb.shape == (1, 1, 1, 3)
         np.testing.assert_allclose(image.depth_m, images[0].depth_m, rtol=1e-4)
         np.testing.assert_allclose(image.rgb.astype(float), images[0].rgb, atol=3)
-    localization_map = LocalizationMap(room_landmarks(300), camera)
+    localization_map = LocalizationMap(Map(room_landmarks(300)), camera)
     ahead = localization_map.landmarks_in_view(pose)
     assert len(ahead.indices) > 0
     for method in ("bins", "set"):
@@ -124,7 +125,7 @@ def test_seventy_thousand_directions() -> None:
     with pytest.raises(ConfigError):
         ViewpointMapConfig(directions=70_000)
     with pytest.raises(ConfigError):
-        build_viewpoint_map(make_scorer("visible", LocalizationMap(landmarks, CAMERA)), GRID, [30], axes)
+        build_viewpoint_map(make_scorer("visible", LocalizationMap(Map(landmarks), CAMERA)), GRID, [30], axes)
 
 
 HUGE = (100_000, 100_000, 100_000)

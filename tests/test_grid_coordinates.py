@@ -29,6 +29,7 @@ from wheretolook.mapping.colmap_model import load_mapping_poses, save_mapping_po
 from wheretolook.mapping.config import MapConfig
 from wheretolook.mapping.georeference import REPORT_FILE
 from wheretolook.mapping.landmarks import Landmarks
+from wheretolook.mapping.map import Map
 from wheretolook.mapping.rendered_map import build_map
 from wheretolook.planning.scene_map import build_viewpoint_map
 from wheretolook.planning.viewpoint_map import ViewpointMap
@@ -156,9 +157,9 @@ def test_scores_are_the_same_by_every_method() -> None:
     landmarks = room_landmarks(400)
     poses = poses_looking_along(GRID.centers()[list(free_voxels())][:8], DIRECTIONS[:8])
     known = poses_looking_along([(3.0, 2.5, 1.5)] * 4, DIRECTIONS[:4])
-    near = LocalizationMap(landmarks, CAMERA, MeshOcclusion(MeshRaycaster(furnished_room())), mapping_poses=known)
+    near = LocalizationMap(Map(landmarks, mapping_poses=known), CAMERA, MeshOcclusion(MeshRaycaster(furnished_room())))
     far = LocalizationMap(
-        far_landmarks(landmarks), CAMERA, MeshOcclusion(MeshRaycaster(far_room())), mapping_poses=far_poses(known)
+        Map(far_landmarks(landmarks), mapping_poses=far_poses(known)), CAMERA, MeshOcclusion(MeshRaycaster(far_room()))
     )
     released = {"set": "set", "expected-inliers": "matchability", "mlp-2d+z": "mlp-2d+z"}
     rules = [name for name, method in scorers().items() if method.learn is None and not method.weights]
@@ -236,8 +237,8 @@ def test_a_viewpoint_map_and_a_robots_file_are_the_same(tmp_path: Path) -> None:
     maps = []
     robots = []
     for name, localization_map, voxels in (
-        ("near", LocalizationMap(landmarks, CAMERA, MeshOcclusion(MeshRaycaster(furnished_room()))), GRID),
-        ("far", LocalizationMap(far_landmarks(landmarks), CAMERA, MeshOcclusion(MeshRaycaster(far_room()))), grid),
+        ("near", LocalizationMap(Map(landmarks), CAMERA, MeshOcclusion(MeshRaycaster(furnished_room()))), GRID),
+        ("far", LocalizationMap(Map(far_landmarks(landmarks)), CAMERA, MeshOcclusion(MeshRaycaster(far_room()))), grid),
     ):
         scorer = make_scorer("set", localization_map, weights=WEIGHTS / "set.safetensors")
         build_viewpoint_map(scorer, voxels, free_voxels(), DIRECTIONS, "fibonacci").save(tmp_path / name)

@@ -11,7 +11,7 @@ import pytest
 
 import wheretolook
 from synthetic_dataset import CAMERA, make_landmarks
-from wheretolook import LocalizationMap, load_scorer, poses_looking_along
+from wheretolook import LocalizationMap, Map, load_scorer, poses_looking_along
 from wheretolook.cli import parse_command
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.files import fingerprint
@@ -29,7 +29,7 @@ def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 @pytest.fixture
 def localization_map() -> LocalizationMap:
-    return LocalizationMap(make_landmarks(np.random.default_rng(0), 200), CAMERA)
+    return LocalizationMap(Map(make_landmarks(np.random.default_rng(0), 200)), CAMERA)
 
 
 def test_what_ships_is_what_lies_in_the_project() -> None:

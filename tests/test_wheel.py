@@ -29,7 +29,7 @@ import numpy as np
 import wheretolook
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.mapping.landmarks import Landmarks
-from wheretolook import LocalizationMap, load_scorer, poses_looking_along
+from wheretolook import LocalizationMap, Map, load_scorer, poses_looking_along
 
 assert wheretolook.__file__.startswith(sys.argv[1]), wheretolook.__file__
 n = 400
@@ -38,7 +38,7 @@ ones = np.ones(n, np.float32)
 directions = ((points - (0, 0, 1)) / np.linalg.norm(points - (0, 0, 1), axis=1, keepdims=True)).astype(np.float32)
 landmarks = Landmarks(np.arange(n), points, np.full(n, 5, np.int32), 0.2 * ones, 15 * ones, directions, 0.02 * ones,
                       2.5 * ones, 0.1 * ones, None, 0.5 * ones, 160 * ones)
-scorer = load_scorer(LocalizationMap(landmarks, PinholeCamera(320, 240, 160.0)))
+scorer = load_scorer(LocalizationMap(Map(landmarks), PinholeCamera(320, 240, 160.0)))
 there, away = scorer.score(poses_looking_along([[0, 0, 1], [0, 0, 1]], [[1, 0, 0], [-1, 0, 0]]))
 print(scorer.name, there > 0.5 > away)
 """

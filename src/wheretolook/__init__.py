@@ -14,12 +14,14 @@ if TYPE_CHECKING:
     from wheretolook.geometry.camera import PinholeCamera
     from wheretolook.geometry.poses import poses_looking_along
     from wheretolook.inputs.localization_map import LocalizationMap
+    from wheretolook.mapping.map import Map
     from wheretolook.planning.viewpoint_map import ViewpointMap
     from wheretolook.scorers.weights import load_scorer
     from wheretolook.select.where_to_look import WhereToLook
 
 __all__ = [
     "LocalizationMap",
+    "Map",
     "PinholeCamera",
     "ViewpointMap",
     "WhereToLook",
@@ -30,6 +32,7 @@ __all__ = [
 
 _HOMES = {
     "LocalizationMap": "wheretolook.inputs.localization_map",
+    "Map": "wheretolook.mapping.map",
     "PinholeCamera": "wheretolook.geometry.camera",
     "load_scorer": "wheretolook.scorers.weights",
     "ViewpointMap": "wheretolook.planning.viewpoint_map",

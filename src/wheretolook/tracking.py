@@ -27,7 +27,7 @@ from pathlib import Path
 from tempfile import TemporaryFile
 from typing import TYPE_CHECKING, Any, cast
 
-from wheretolook.utils.errors import MissingRunError, StorageError, TrackingError, TrackingWarning
+from wheretolook.utils.errors import MissingRunError, StorageError, TrackingError, TrackingWarning, no_option
 from wheretolook.utils.files import copy_file, storage_errors, temporary_folder, write_json
 from wheretolook.utils.package import VERSION
 from wheretolook.utils.processes import hold
@@ -49,7 +49,7 @@ class TrackingConfig:
     """
 
     folder: str = "mlruns"
-    experiment: str = ""
+    experiment: str = no_option("")
 
     @property
     def root(self) -> Path:

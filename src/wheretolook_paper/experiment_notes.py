@@ -44,7 +44,7 @@ _ALL = "params.method LIKE '%' AND params.candidates = 'all'"  # without the run
 _CHOICES = ("params.method", "params.occlusion", f"metrics.{SHARE}", f"metrics.{AUC}")
 _TOP_N = tuple(f"metrics.top-{n}/normalized_0.05m_0.4deg" for n in (1, 5, 10))
 _KEPT = "kept_val_average_precision"
-_LEARNERS = ("params.learner", "params.learnt_from", "params.seed", f"metrics.{AUC}", "metrics.regret_others")
+_LEARNERS = ("params.learner", "params.trained_on", "params.seed", f"metrics.{AUC}", "metrics.regret_others")
 _PATHS = ("params.method", "params.task", "metrics.times_forward", "metrics.times_forward_length")
 
 
@@ -91,7 +91,7 @@ and `history.csv` are artifacts.""",
     "learners": Purpose(
         f"""\
 All learners on scenes that they were not trained on. The run's own numbers are those of the learner with
-the lowest mean regret (tag `best`). Open it (+) to compare: in it is a run for each `learner` × `learnt_from` × `seed`.
+the lowest mean regret (tag `best`). Open it (+) to compare: in it is a run for each `learner` × `trained_on` × `seed`.
 
 - `{REGRET}`, `{AUC}`: on the test scenes; **sort by the first, lowest first**
 - `regret_others`, `average_precision_others`: on scenes by others; `…_validation`: what one may choose a learner by

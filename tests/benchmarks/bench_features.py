@@ -33,6 +33,7 @@ from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.localization.localizer import Localizer
 from wheretolook.mapping.config import MapConfig
 from wheretolook.mapping.landmarks import Landmarks
+from wheretolook.mapping.map import Map
 from wheretolook.mapping.rendered_map import build_map
 from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.scorers.registry import make_scorer
@@ -147,8 +148,9 @@ def main() -> None:
             extractor = KeypointExtractor(config, args.device)
             keypoints, seconds = keypoints_of(views, scene, extractor, folder / name / "keypoints", args.device)
             landmarks = Landmarks.load(map_folder / "landmarks.npz")
-            full = LocalizationMap(landmarks, CAMERA, occlusion, args.device)
-            without = replace(full, landmarks=replace(landmarks, ambiguity=np.full_like(landmarks.ambiguity, np.nan)))
+            full = LocalizationMap(Map(landmarks), CAMERA, occlusion, args.device)
+            unknown = replace(landmarks, ambiguity=np.full_like(landmarks.ambiguity, np.nan))
+            without = replace(full, map=Map(unknown))
             scorers = {"bundled": load_scorer(full), "without ambiguity": load_scorer(without)}
             scorers["bins"] = make_scorer("bins", full)
             localizer = Localizer(landmarks, CAMERA, device=args.device)

@@ -29,6 +29,7 @@ from wheretolook.geometry.lattices import fibonacci_sphere
 from wheretolook.geometry.poses import Float, rotation_looking_along
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.landmarks import Landmarks
+from wheretolook.mapping.map import Map
 from wheretolook.scorers.weights import load_scorer
 from wheretolook.utils.warp import start_warp
 from wheretolook.visibility.counting import SurveyOptions, survey
@@ -72,7 +73,7 @@ def scoring(landmarks: Landmarks, room: np.ndarray, count: int) -> Callable[[], 
     chosen = rng.integers(0, room.max() + 1, count)
     locations = room_offset(chosen) + rng.uniform(*ROOM_M, (count, 3)) * (0.5, 0.5, 1)
     occlusion = StoredOcclusion.from_mask(locations, room == chosen[:, None])
-    scorer = load_scorer(None, LocalizationMap(landmarks, PinholeCamera(), occlusion, "cpu"))
+    scorer = load_scorer(None, LocalizationMap(Map(landmarks), PinholeCamera(), occlusion, "cpu"))
     axes = fibonacci_sphere(500)
     return lambda: scorer.score_directions(locations, axes)
 

@@ -20,6 +20,7 @@ from common import points_on_surface, room_map, timed
 
 from wheretolook.geometry.lattices import VoxelGrid, fibonacci_sphere
 from wheretolook.inputs.localization_map import LocalizationMap
+from wheretolook.mapping.map import Map
 from wheretolook.planning.routes import TurnLimit, best_sequence
 from wheretolook.planning.scene_map import build_viewpoint_map
 from wheretolook.planning.stops import refine_directions
@@ -96,7 +97,7 @@ def main() -> None:
     occlusion = MeshOcclusion(MeshRaycaster(mesh, args.device), two_sided=free_space.two_sided)
     directions = fibonacci_sphere(args.directions)
 
-    mapped = LocalizationMap(landmarks, room.camera, occlusion, args.device)
+    mapped = LocalizationMap(Map(landmarks), room.camera, occlusion, args.device)
     scorer = load_scorer(args.weights, mapped) if args.weights else make_scorer("bins", mapped)
     print(f"{len(free)} voxels x {len(directions)} directions, {len(landmarks):,} landmarks, "
           f"{len(mesh.triangles):,} triangles, {scorer.name}, on {args.device}, "

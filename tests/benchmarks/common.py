@@ -14,6 +14,7 @@ from wheretolook.geometry.mesh import TexturedMesh
 from wheretolook.geometry.poses import Float, poses_looking_along
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.landmarks import Landmarks
+from wheretolook.mapping.map import Map
 from wheretolook.scenes.config import ApartmentConfig
 from wheretolook.scenes.loading import load_mesh, save_glb
 from wheretolook.space.free_space import FreeSpace
@@ -71,7 +72,7 @@ def room_map(n_landmarks: int, locations: Float, device: str) -> LocalizationMap
         ambiguity=uniform(0.5, 1),
     )
     occlusion = StoredOcclusion.from_mask(locations, rng.random((len(locations), n_landmarks)) < 0.5)
-    return LocalizationMap(landmarks, PinholeCamera(), occlusion, device)
+    return LocalizationMap(Map(landmarks), PinholeCamera(), occlusion, device)
 
 
 def points_on_surface(mesh: TexturedMesh, n: int, rng: np.random.Generator) -> Float:

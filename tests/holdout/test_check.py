@@ -95,12 +95,12 @@ def test_blocks_share_out_all_photographs_and_grow(corridor):
     assert sorted(np.concatenate([block.held_out for block in parts]).tolist()) == [*range(N)]
     (alone,) = (block for block in parts if np.isin(ALONE, block.held_out).any())  # they share landmarks
     assert np.isin(ALONE, alone.held_out).all()
-    sees = observation_matrix(source.arrays, source.frame)
+    sees = observation_matrix(source.arrays, source.rig_frame)
     most = int((1 - MIN_REST) * N)
     grown = [block for block in blocks if not block.is_part]
     assert grown and max(len(block.held_out) for block in grown) <= most
     for block in grown:
-        kept = np.quantile(landmarks_kept(sees, source.frame[block.held_out]), 0.25)
+        kept = np.quantile(landmarks_kept(sees, source.rig_frame[block.held_out]), 0.25)
         assert kept <= KEPT[0] or len(block.held_out) == most
     few = choose_blocks(source, views=3)
     assert max(len(block.tested) for block in few) == 3

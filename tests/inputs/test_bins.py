@@ -11,6 +11,7 @@ from wheretolook.inputs.bins import bin_views, bin_views_plain, count_bins
 from wheretolook.inputs.channels import ALL_CHANNELS, CHANNELS, LANDMARK_CHANNELS
 from wheretolook.inputs.landmark_features import ATTRIBUTES, LandmarkDescriber
 from wheretolook.inputs.localization_map import LocalizationMap
+from wheretolook.mapping.map import Map
 from wheretolook.visibility.frustum import LandmarkSets, PosedViews, landmarks_in_view
 
 LOOKING_ALONG_Z = np.eye(3, 4)[None]
@@ -84,7 +85,7 @@ def test_channels_of_landmarks_are_means_of_their_attributes(random_views, disto
     arguments = posed_views(random_views, DISTORTED if distorted else None)
     binned = bin_views(arguments, bins=1, landmarks=landmarks)
     visible = landmarks_in_view(arguments)
-    localization_map = LocalizationMap(landmarks, arguments.camera)
+    localization_map = LocalizationMap(Map(landmarks), arguments.camera)
     described = LandmarkDescriber(localization_map).describe(random_views.cam_from_world, visible)
     of_bins = [ATTRIBUTES.index(name) for name in LANDMARK_CHANNELS]
     for view in range(len(random_views.cam_from_world)):

@@ -11,6 +11,7 @@ from wheretolook.inputs.channels import ATTRIBUTES, POSE_ATTRIBUTES
 from wheretolook.inputs.landmark_features import LandmarkDescriber
 from wheretolook.inputs.localization_map import LocalizationMap, shared_locations
 from wheretolook.mapping.landmarks import MAP_ATTRIBUTES
+from wheretolook.mapping.map import Map
 from wheretolook.visibility.occlusion import StoredOcclusion
 
 COLMAP = ColmapCamera("OPENCV", 160, 120, (80.0, 80.0, 80.0, 60.0, -0.1, 0.01, 1e-3, -1e-3))
@@ -28,7 +29,7 @@ def localization_map(request, device):
     landmarks = make_landmarks(rng, 400)
     centers = np.unique(-np.einsum("bji,bj->bi", some_views()[:, :, :3], some_views()[:, :, 3]).round(6), axis=0)
     occlusion = StoredOcclusion.from_mask(centers, rng.random((len(centers), 400)) < 0.7)
-    return LocalizationMap(landmarks, request.param, occlusion, device)
+    return LocalizationMap(Map(landmarks), request.param, occlusion, device)
 
 
 def test_each_landmark_by_hand(localization_map):

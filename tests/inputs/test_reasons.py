@@ -20,7 +20,7 @@ def test_counts_by_the_definitions(tmp_path):
     mapped_along = np.roll(room.landmarks.mapping_direction, 1, axis=0)  # and some oblique
     ambiguity = np.linspace(0.9, 1.0, len(room.landmarks), dtype=np.float32)
     changed = {"mapping_distance_m": mapped_m, "mapping_direction": mapped_along, "ambiguity": ambiguity}
-    room = replace(room, landmarks=replace(room.landmarks, **changed))
+    room = replace(room, map=replace(room.map, landmarks=replace(room.landmarks, **changed)))
     axes = direction_lattice(12)
     poses = poses_looking_along(np.repeat(POINTS, 12, axis=0), np.tile(axes, (4, 1)))
     counts = ReasonCounter(room).count(poses)

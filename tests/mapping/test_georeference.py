@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from wheretolook.commands.map import Map
 from wheretolook.geometry.camera import CameraConfig
-from wheretolook.mapping.config import ExistingModelConfig, FrameOptions, MapConfig, MarkerConfig, PhotographsConfig
+from wheretolook.mapping.config import FrameOptions, ImportConfig, MapConfig, MarkerConfig, PhotographsConfig
 from wheretolook.mapping.georeference import (
     MapScale,
     Marker,
@@ -130,28 +131,25 @@ def test_invalid_settings_are_rejected():
     for settings in ({"marker_size_m": 0.2, "marker_table": Path("m.csv")}, {"marker_size_m": -1.0}):
         with pytest.raises(ConfigError):
             MarkerConfig(**settings)
-    sized = PhotographsConfig(Path("photos"), scale=MarkerConfig(marker_size_m=0.2))
-    of_model = ExistingModelConfig(Path("model"))
-    for settings in (
-        {"photographs": sized, "frame": known},
-        {"photographs": sized, "frame": FrameOptions(scale=2), "existing": of_model},
-        {"photographs": PhotographsConfig(Path("photos")), "frame": FrameOptions(scale=2)},
-        {"frame": FrameOptions(up="level")},
-    ):
-        with pytest.raises(ConfigError):
-            MapConfig(**settings)
+    sized = MarkerConfig(marker_size_m=0.2)
+    with pytest.raises(ConfigError):
+        PhotographsConfig(Path("photos"), scale=sized, frame=known)
+    with pytest.raises(ConfigError):
+        PhotographsConfig(Path("photos"), frame=FrameOptions(scale=2))
+    with pytest.raises(ConfigError):
+        ImportConfig(model=Path("model"), scale=sized, frame=FrameOptions(scale=2))
+    with pytest.raises(ConfigError):
+        Map(up="level")
 
 
-@pytest.mark.parametrize(
-    "source", [{"photographs": PhotographsConfig(Path("photos"))}, {"existing": ExistingModelConfig(Path("model"))}]
-)
+@pytest.mark.parametrize("source", [{"photographs": PhotographsConfig(Path("photos"))}, {"model": Path("model")}])
 def test_options_of_renders_are_rejected_by_name_for_other_maps(source):
     of_renders = {"camera": CameraConfig(), "draw_camera": True, "vary": True, "appearance": 0.4, "keep_images": True}
-    MapConfig(**source, keep_database=True)
+    Map(**source, mapping=MapConfig(keep_database=True))
     for name, value in of_renders.items():
-        MapConfig(**{name: value})
+        Map(mapping=MapConfig(**{name: value}))
         with pytest.raises(ConfigError, match=rf"photographs or a model.*'mapping\.{name}'"):
-            MapConfig(**source, **{name: value})
+            Map(**source, mapping=MapConfig(**{name: value}))
 
 
 def test_a_mislabelled_position_of_many_is_left_out(caplog):

@@ -12,7 +12,7 @@ from mapping.test_landmarks import hand_written_model
 from wheretolook.cli import main
 from wheretolook.mapping.colmap_model import model_arrays, read_model, write_model
 from wheretolook.mapping.feature_files import read_descriptors
-from wheretolook.mapping.mapped_images import choose_features, find_features, find_photographs, open_colmap
+from wheretolook.mapping.map import Map, choose_features, find_features, find_photographs
 from wheretolook.utils.errors import MapWarning
 from wheretolook.utils.files import sha256
 from wheretolook.utils.package import WEIGHTS, shipped
@@ -34,7 +34,7 @@ def outputs(tmp_path):
 def test_a_map_is_opened_with_the_features_that_hloc_wrote_beside_it():
     with warnings.catch_warnings():
         warnings.filterwarnings("error", message=".*(features|descriptors)", category=MapWarning)
-        landmarks = open_colmap(SFM).landmarks
+        landmarks = Map.open(SFM).landmarks
     assert len(landmarks) == N_LANDMARKS and landmarks.features == "aliked"
     assert np.isfinite(landmarks.ambiguity).all()
 
@@ -62,7 +62,7 @@ def test_features_that_are_not_found_are_reported(outputs, missing):
     if missing == "database too":
         (outputs / "sfm_aliked/database.db").unlink()
     with pytest.warns(MapWarning, match="SIFT"):
-        assert open_colmap(outputs / "sfm_aliked").landmarks.features == ""
+        assert Map.open(outputs / "sfm_aliked").landmarks.features == ""
 
 
 def test_of_several_files_the_one_of_the_model_is_found(outputs):

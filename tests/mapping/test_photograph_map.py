@@ -21,7 +21,7 @@ from wheretolook.dataset.viewpoint_table import UNLABELLED, poses
 from wheretolook.geometry.poses import camera_centers
 from wheretolook.mapping import photograph_map as incremental
 from wheretolook.mapping.colmap_model import colmap_poses, model_arrays, read_model
-from wheretolook.mapping.config import FrameOptions, MapConfig, MarkerConfig, PhotographsConfig
+from wheretolook.mapping.config import FrameOptions, MarkerConfig, PhotographsConfig
 from wheretolook.mapping.georeference import fit_similarity, median_depths
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.mapping.map_frame import read_frame
@@ -47,7 +47,7 @@ def photographs(tmp_path_factory):
 def config_of(photographs, frame=FrameOptions(), **markers):
     known = MarkerConfig(**markers)
     camera = {"camera_model": "SIMPLE_PINHOLE", "camera_params": PARAMS}
-    return MapConfig(photographs=PhotographsConfig(photographs, scale=known, **camera), frame=frame)
+    return PhotographsConfig(photographs, scale=known, frame=frame, **camera)
 
 
 @pytest.fixture(scope="module")
@@ -141,7 +141,7 @@ def test_photographs_that_do_not_overlap_are_refused(tmp_path):
         blobs = cv2.GaussianBlur(rng.normal(size=(240, 320, 3)), (0, 0), 3)
         cv2.imwrite(str(tmp_path / f"{index}.png"), np.clip(128 + 600 * blobs, 0, 255).astype(np.uint8))
     with pytest.raises(MapError):
-        map_photographs(MapConfig(photographs=PhotographsConfig(tmp_path)), tmp_path / "map", tmp_path / "work",
+        map_photographs(PhotographsConfig(tmp_path), tmp_path / "map", tmp_path / "work",
                         progress=False)  # fmt: skip
     assert not (tmp_path / "map").exists()
 
@@ -153,7 +153,7 @@ def experiment(mapped, photographs, tmp_path_factory):
         name="photos",
         data=tmp_path_factory.mktemp("data"),
         device="cpu",
-        mapping=config_of(photographs),
+        source={"photographs": config_of(photographs)},
         sample=SampleConfig(grid=(6, 4, 3), directions=60, keep=10),
         scenes=ScenesConfig(mapped_space=MappedSpaceConfig(max_camera_distance_m=0.6)),
     )
@@ -167,8 +167,8 @@ def experiment(mapped, photographs, tmp_path_factory):
 @pytest.mark.slow
 def test_a_scene_of_photographs_is_sampled_and_scored_but_not_labelled(experiment):
     scale = MarkerConfig(marker_size_m=MARKERS[0].size_m)
-    photographs = replace(experiment.mapping.photographs, scale=scale)
-    metric = replace(experiment, mapping=replace(experiment.mapping, photographs=photographs))
+    photographs = replace(experiment.source["photographs"], scale=scale)
+    metric = replace(experiment, source={"photographs": photographs})
     said = []
     run(Map, metric, said.append)
     assert any("scale: markers" in line for line in said)

@@ -18,6 +18,7 @@ from wheretolook.geometry.lattices import VoxelGrid, direction_lattice
 from wheretolook.geometry.poses import Float
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.landmarks import Landmarks
+from wheretolook.mapping.map import Map
 from wheretolook.planning.scene_map import build_viewpoint_map
 from wheretolook.planning.viewpoint_map import ViewpointMap
 from wheretolook.rendering.raycasting import MeshRaycaster
@@ -71,7 +72,7 @@ def free_voxels() -> tuple[int, ...]:
 
 def room_map(landmarks: Landmarks, model: OcclusionModel | None = None) -> LocalizationMap:
     """Return the localization map of the room."""
-    return LocalizationMap(landmarks, CAMERA, model or occlusion())
+    return LocalizationMap(Map(landmarks), CAMERA, model or occlusion())
 
 
 def build(landmarks: Landmarks, method: str = "bins", directions: Float = DIRECTIONS) -> ViewpointMap:

@@ -16,6 +16,7 @@ from wheretolook.dataset.viewpoint_table import poses
 from wheretolook.geometry.camera import Camera, ColmapCamera, PinholeCamera
 from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.inputs.localization_map import LocalizationMap
+from wheretolook.mapping.map import Map
 from wheretolook.planning.routes import PlannedPath
 from wheretolook.scorers.base import Scorer
 from wheretolook.scorers.registry import make_scorer
@@ -57,7 +58,7 @@ def planned(folder: Path, camera: Camera, method: str, film: str = "none") -> tu
         return replace(experiment, plan=replace(experiment.plan, planner=planner)).run()
 
     path = patiently(within)
-    scorer = make_scorer(method, LocalizationMap(LANDMARKS, camera, occlusion()), weights=experiment.plan.weights)
+    scorer = make_scorer(method, LocalizationMap(Map(LANDMARKS), camera, occlusion()), weights=experiment.plan.weights)
     return path, pd.read_csv(folder / "way" / "path.csv"), scorer
 
 

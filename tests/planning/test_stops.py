@@ -12,6 +12,7 @@ from planning.rooms import CAMERA, occlusion, room_landmarks
 from wheretolook.geometry.lattices import direction_lattice
 from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.inputs.localization_map import LocalizationMap
+from wheretolook.mapping.map import Map
 from wheretolook.planning.config import PathConfig, StopConfig
 from wheretolook.planning.routes import PlannedPath, TurnLimit, best_sequence
 from wheretolook.planning.scene_map import path_views
@@ -28,7 +29,7 @@ POSITIONS = np.linspace((0.8, 0.8, 1.4), (3.2, 0.8, 1.4), 5)
 
 @pytest.fixture(scope="module")
 def scorer() -> Scorer:
-    return make_scorer("set", LocalizationMap(room_landmarks(300), CAMERA, occlusion()), weights=WEIGHTS)
+    return make_scorer("set", LocalizationMap(Map(room_landmarks(300)), CAMERA, occlusion()), weights=WEIGHTS)
 
 
 @pytest.fixture(scope="module")

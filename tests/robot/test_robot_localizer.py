@@ -30,6 +30,7 @@ from wheretolook.localization.localizer import Localizer
 from wheretolook.localization.rig import Look
 from wheretolook.looks.next_look import N_DIRECTIONS, NextLookSelector, mean_scores_by_pitch
 from wheretolook.mapping.landmarks import Landmarks
+from wheretolook.mapping.map import Map
 from wheretolook.mapping.map_frame import MapFrame
 from wheretolook.robot.export import export_localizer, export_robot
 from wheretolook.robot.localizer import ImageSequence, RobotLocalizer
@@ -88,7 +89,7 @@ def view_of(landmarks: Landmarks, pose: Float) -> tuple[np.ndarray, np.ndarray]:
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("robot")
-    source = LocalizationMap(described(), CAMERA)
+    source = LocalizationMap(Map(described()), CAMERA)
     export_localizer(described(), described().ids, mean_scores_by_pitch(load_scorer(source), PLACES), out)
     return export_robot(source, BUNDLED, out)
 
@@ -122,7 +123,7 @@ def test_poses_are_those_of_the_localizer(folder: Path) -> None:
 
 
 def test_the_next_look_is_that_of_the_selector(folder: Path) -> None:
-    scorer = load_scorer(LocalizationMap(described(), CAMERA))
+    scorer = load_scorer(LocalizationMap(Map(described()), CAMERA))
     selector = NextLookSelector(ByPose(scorer), mean_scores_by_pitch(scorer, PLACES))
     localizer = RobotLocalizer(folder)
     robot_scorer = RobotScorer(folder)
@@ -147,7 +148,7 @@ def test_a_prior_adds_the_pose_that_ambiguous_matches_hide(tmp_path: Path) -> No
     columns = {name: np.concatenate([v, v]) for name, v in vars(one).items() if isinstance(v, np.ndarray)}
     twice = Landmarks(**columns | {"points": points, "ids": np.arange(len(points))})
     export_localizer(twice, twice.ids, np.zeros(N_DIRECTIONS), tmp_path)
-    export_robot(LocalizationMap(twice, CAMERA), BUNDLED, tmp_path)
+    export_robot(LocalizationMap(Map(twice), CAMERA), BUNDLED, tmp_path)
     robot = RobotLocalizer(tmp_path)
     view = view_of(one, POSES[0])
     assert not robot.localize([robot.match(*view)]).poses
@@ -186,9 +187,9 @@ def test_poses_are_in_the_frame_of_the_map(tmp_path: Path) -> None:
     landmarks = described()
     frame = Similarity(2.0, np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), np.array([1.0, 2.0, 3.0]))
     export_localizer(landmarks, landmarks.ids, np.zeros(N_DIRECTIONS), tmp_path)
-    there = replace(LocalizationMap(landmarks, CAMERA).frame, world_from_map=frame)
+    there = replace(LocalizationMap(Map(landmarks), CAMERA).frame, world_from_map=frame)
     assert isinstance(there, MapFrame)
-    export_robot(LocalizationMap(landmarks, CAMERA, frame=there), BUNDLED, tmp_path)
+    export_robot(LocalizationMap(Map(landmarks, frame=there), CAMERA), BUNDLED, tmp_path)
     robot = RobotLocalizer(tmp_path)
     result = robot.localize([robot.match(*view_of(landmarks, POSES[0]))])
     expected = frame.inverse.apply_to_poses(POSES[:1])[0]

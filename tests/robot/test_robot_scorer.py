@@ -25,6 +25,7 @@ from wheretolook.inputs.channels import ATTRIBUTES
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.inputs.statistics import FeatureStatistics
 from wheretolook.mapping.landmarks import Landmarks
+from wheretolook.mapping.map import Map
 from wheretolook.robot import wheretolook_robot
 from wheretolook.robot.export import export_robot, pinhole_of
 from wheretolook.robot.wheretolook_robot import RobotScorer
@@ -104,7 +105,7 @@ NETWORKS = {
 def test_scores_are_those_of_pytorch(name: str, camera: Camera, tmp_path: Path) -> None:
     weights = tmp_path / "set.safetensors"
     random_network(len(name), **NETWORKS[name]).save(weights)
-    localization_map = LocalizationMap(walls(1500, len(name)), camera)
+    localization_map = LocalizationMap(Map(walls(1500, len(name))), camera)
     poses = some_poses(120, len(name))
     scorer = load_scorer(weights, localization_map)
     expected = scorer.score(poses)
@@ -122,7 +123,7 @@ def test_scores_are_those_of_pytorch(name: str, camera: Camera, tmp_path: Path) 
 def test_scores_at_any_accuracy_are_those_of_pytorch(name: str, tmp_path: Path) -> None:
     weights = tmp_path / "set.safetensors"
     random_network(len(name), **NETWORKS[name]).save(weights)
-    localization_map = LocalizationMap(walls(1500, len(name)), CAMERAS["paper"])
+    localization_map = LocalizationMap(Map(walls(1500, len(name))), CAMERAS["paper"])
     poses = some_poses(120, len(name))
     for accuracy in ((0.001, 0.01), (0.02, 0.2), (0.25, 2.0), (1e3, 90.0), (np.inf, np.inf)):
         for file in (weights, BUNDLED):
@@ -138,7 +139,7 @@ def test_scores_at_any_accuracy_are_those_of_pytorch(name: str, tmp_path: Path) 
 @pytest.mark.parametrize("n", [1, 60, 25_000])
 def test_bundled_weights_on_maps_of_any_size(n: int, tmp_path: Path) -> None:
     """From views without landmarks to views with more than are sampled."""
-    localization_map = LocalizationMap(walls(n, n), CAMERAS["wide, upright"])
+    localization_map = LocalizationMap(Map(walls(n, n)), CAMERAS["wide, upright"])
     poses = some_poses(80, n)
     expected = load_scorer(BUNDLED, localization_map).score(poses)
     views = RobotScorer(export_robot(localization_map, BUNDLED, tmp_path)).views(poses)
@@ -154,7 +155,9 @@ def room_map() -> LocalizationMap:
     axis = rng.integers(0, 3, 600)
     points[np.arange(600), axis] = np.array(ROOM)[axis] * rng.integers(0, 2, 600)
     space = FreeSpace(furnished_room())
-    return LocalizationMap(replace(make_landmarks(rng, 600), points=points), CAMERA, MeshOcclusion(space.raycaster))
+    return LocalizationMap(
+        Map(replace(make_landmarks(rng, 600), points=points)), CAMERA, MeshOcclusion(space.raycaster)
+    )
 
 
 @pytest.fixture(scope="module")
@@ -243,7 +246,7 @@ def test_the_folder_runs_by_itself(folder: Path, tmp_path: Path) -> None:
     np.save(copy / "poses.npy", poses)
     subprocess.run([sys.executable, "-c", WITHOUT_PYTORCH], cwd=copy, check=True)
     np.testing.assert_array_equal(np.load(copy / "scores.npy"), RobotScorer(folder).score(poses))
-    other = export_robot(LocalizationMap(walls(50), CAMERA), BUNDLED, tmp_path / "other")
+    other = export_robot(LocalizationMap(Map(walls(50)), CAMERA), BUNDLED, tmp_path / "other")
     shutil.copy(other / "landmarks.npz", copy)
     with pytest.raises(ValueError):  # landmarks of another export
         RobotScorer(copy)

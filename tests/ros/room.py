@@ -17,6 +17,7 @@ from wheretolook.geometry.poses import Float, poses_looking_along
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.looks.next_look import mean_scores_by_pitch
 from wheretolook.mapping.landmarks import Landmarks
+from wheretolook.mapping.map import Map
 from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.robot.export import export_localizer, export_robot
 
@@ -74,6 +75,6 @@ def room_landmarks(mesh: TexturedMesh) -> Landmarks:
 def write_folder(mesh: TexturedMesh, folder: Path, places: Float | None = None) -> Path:
     """Export the robot's folder, with the occlusion at places (L, 3) m."""
     landmarks = room_landmarks(mesh)
-    source = LocalizationMap(landmarks, PinholeCamera())
+    source = LocalizationMap(Map(landmarks), PinholeCamera())
     export_localizer(landmarks, landmarks.ids, mean_scores_by_pitch(load_scorer(source), CENTER[None]), folder)
     return export_robot(source, WEIGHTS, folder, places, progress=False)

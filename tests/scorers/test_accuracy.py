@@ -20,6 +20,7 @@ from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.geometry.similarity import Similarity
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.colmap_model import write_model
+from wheretolook.mapping.map import Map
 from wheretolook.scorers.registry import find, make_scorer
 from wheretolook.scorers.set.accuracy import STATISTICS, AccuracyModel, LogError
 from wheretolook.scorers.set.network import ALL_STATISTICS
@@ -133,7 +134,7 @@ def test_the_bundled_file_is_the_model_and_damage_is_found(tmp_path):
 
 @pytest.fixture(scope="module")
 def scorer():
-    scorer = load_scorer(LocalizationMap(make_landmarks(np.random.default_rng(0), 400), CAMERA))
+    scorer = load_scorer(LocalizationMap(Map(make_landmarks(np.random.default_rng(0), 400)), CAMERA))
     assert isinstance(scorer, SetScorer)
     return scorer
 
@@ -186,7 +187,9 @@ def sphere(radius_m):
         "mapping_distance_m": np.full(2000, radius_m, np.float32),
         "mapping_direction": -fibonacci_sphere(2000).astype(np.float32),
     }
-    scorer = load_scorer(LocalizationMap(replace(landmarks, points=points, **of_map), PinholeCamera(400, 300, 200.0)))
+    scorer = load_scorer(
+        LocalizationMap(Map(replace(landmarks, points=points, **of_map)), PinholeCamera(400, 300, 200.0))
+    )
     assert isinstance(scorer, SetScorer)
     return scorer
 
@@ -252,7 +255,7 @@ def test_landmarks_mapped_from_one_place_are_out_of_range(poses):
             "mapping_distance_spread": np.full(400, spread, np.float32),
         }
         landmarks = replace(make_landmarks(np.random.default_rng(0), 400), **of_map)
-        report = load_scorer(LocalizationMap(landmarks, PinholeCamera(400, 300, 200.0))).report(poses)
+        report = load_scorer(LocalizationMap(Map(landmarks), PinholeCamera(400, 300, 200.0))).report(poses)
         return report.in_range & (report.n_visible > 0)
 
     assert seen_and_in_range(8.0, 0.1, 0.1).sum() > 10

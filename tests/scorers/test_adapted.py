@@ -12,6 +12,7 @@ from wheretolook.geometry.lattices import fibonacci_sphere
 from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.landmarks import Landmarks
+from wheretolook.mapping.map import Map
 from wheretolook.scorers.adapted.calibration import LocalizedViews, adapt, calibrate, log_losses, splits
 from wheretolook.scorers.adapted.score import AdaptedNetwork
 from wheretolook.scorers.set.network import SetNetwork
@@ -70,7 +71,7 @@ def test_photographs_are_judged_by_blocks_that_share_none_with_those_trained_on(
 def place(tmp_path_factory):
     """A map, and weights adapted to it."""
     scene = make_dataset(tmp_path_factory.mktemp("data") / "place", ("test",)).scenes[0]
-    localization_map = LocalizationMap(scene.read_landmarks(), scene.camera)
+    localization_map = LocalizationMap(Map(scene.read_landmarks()), scene.camera)
     base = TrainedNetwork.load(SET, SetNetwork, "set")
     network = AdaptedNetwork(base.network, base.scale, base.offset, 50)
     network.place = torch.from_numpy(localization_map.landmarks.points[:50].copy())
@@ -99,7 +100,7 @@ def test_they_are_refused_in_another_scene_unless_forced(place):
     localization_map, path = place
     landmarks = localization_map.landmarks
     moved = Landmarks(**{**landmarks.__dict__, "points": landmarks.points + np.array([0.5, 0, 0])})
-    other = LocalizationMap(moved, localization_map.camera)
+    other = LocalizationMap(Map(moved), localization_map.camera)
     with pytest.raises(WeightsError):
         load_scorer(path, other)
     assert load_scorer(path, other, anywhere=True).name == "adapted"

@@ -17,6 +17,7 @@ from wheretolook.dataset.viewpoint_table import poses
 from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.inputs.landmark_features import LandmarkDescriber
 from wheretolook.inputs.localization_map import LocalizationMap
+from wheretolook.mapping.map import Map
 from wheretolook.scorers.registry import learned, make_scorer, scorers
 from wheretolook.scorers.set import MatchabilityConfig, SetConfig
 from wheretolook.scorers.set.network import MatchabilityNetwork
@@ -148,7 +149,7 @@ def test_views_outside_the_training_range_warn_once(dataset, trained, name):
     far = views.copy()
     far[:, :, 3] *= 50
     farther = replace(landmarks, points=50 * landmarks.points, mapping_distance_m=50 * landmarks.mapping_distance_m)
-    scorer = make_scorer(name, LocalizationMap(farther, CAMERA), weights=weights)
+    scorer = make_scorer(name, LocalizationMap(Map(farther), CAMERA), weights=weights)
     assert scorer.in_range(far).mean() < 0.9
     assert len(warnings_of(scorer, far)) == 1 and not warnings_of(scorer, far)
 

@@ -14,9 +14,10 @@ from synthetic_dataset import make_landmarks
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import camera_centers, poses_looking_along
 from wheretolook.inputs.localization_map import LocalizationMap
-from wheretolook.mapping.colmap_model import ModelArrays
+from wheretolook.mapping.colmap_model import ModelArrays, select_points
+from wheretolook.mapping.config import FrameOptions
 from wheretolook.mapping.landmarks import Landmarks, load_colmap_landmarks
-from wheretolook.mapping.mapped_images import MappedImages
+from wheretolook.mapping.map import Map
 from wheretolook.robot.export import export_robot
 from wheretolook.robot.wheretolook_robot import RobotScorer
 from wheretolook.scorers.set.network import SetNetwork
@@ -52,12 +53,6 @@ def constant_network():
     return network
 
 
-def first_of(landmarks, n):
-    """Return the first landmarks."""
-    values = {name: v[:n] if isinstance(v, np.ndarray) else v for name, v in vars(landmarks).items()}
-    return Landmarks(**values)
-
-
 def observed_map(p_detect, n_images=40, n=2000, photographs=True):
     """Return a map whose images, of two cameras, observe each landmark in view with a probability."""
     rng = np.random.default_rng(0)
@@ -82,14 +77,22 @@ def observed_map(p_detect, n_images=40, n=2000, photographs=True):
         errors_px=landmarks.reprojection_error_px.astype(np.float64),
         image_ids=np.arange(n_images),
         image_names=[f"{row}.jpg" for row in range(n_images)],
+        image_poses=poses,
         image_centers=camera_centers(poses),
+        image_cameras=np.arange(n_images) % 3,
         image_focal_px=np.array([camera.mean_focal_px for camera in cameras]),
         observation_start=np.concatenate([[0], np.cumsum(landmarks.track_length)]),
         observation_image=image,
         observation_keypoint=np.zeros(len(image), dtype=np.int64),
     )
-    images = MappedImages(landmarks, arrays, poses, tuple(cameras))
-    return LocalizationMap(landmarks, WIDE, mapping_poses=poses, photographs=photographs, images=images)
+    by_id = {0: NARROW, 1: WIDE, 2: WIDE}
+    whole = Map(landmarks, poses, has_photographs=photographs, cameras=by_id, images=arrays)
+    return LocalizationMap(whole, WIDE)
+
+
+def with_images(localization_map, images):
+    """Return a map with other images."""
+    return replace(localization_map, map=replace(localization_map.map, images=images))
 
 
 @pytest.mark.parametrize("p_detect", [0.2, 0.3, 0.6])
@@ -107,23 +110,27 @@ def test_the_offset_is_bounded():
 def test_few_images_do_not_determine_it():
     assert detection_offset(constant_network(), observed_map(0.6, n_images=4)) == 0
     assert detection_offset(constant_network(), observed_map(0.6, n=3)) == 0
-    assert detection_offset(constant_network(), replace(observed_map(0.6), images=None)) == 0
+    assert detection_offset(constant_network(), with_images(observed_map(0.6), None)) == 0
 
 
 def test_maps_that_do_not_show_it():
     """Stored occlusion is of all landmarks at other locations; no third image observes what two do."""
     localization_map = observed_map(0.6)
-    images = localization_map.images
+    images = localization_map.map.images
     assert images is not None
-    stored = StoredOcclusion.from_mask(np.zeros((1, 3)), np.ones((1, len(images.landmarks)), dtype=bool))
+    n = len(localization_map.landmarks)
+    stored = StoredOcclusion.from_mask(np.zeros((1, 3)), np.ones((1, n), dtype=bool))
     trained = replace(bundled(), network=constant_network())
     for occlusion in (stored, CachedOcclusion(stored)):
         unknown = for_map(trained, replace(localization_map, occlusion=occlusion)).network
         torch.testing.assert_close(unknown.state_dict(), trained.network.state_dict())
-    n = len(images.landmarks)
-    arrays = replace(images.arrays, observation_start=2 * np.arange(n + 1), observation_image=np.tile([0, 1], n))
-    pairs = replace(images, arrays=replace(arrays, observation_keypoint=np.zeros(2 * n, dtype=np.int64)))
-    assert detection_offset(constant_network(), replace(localization_map, images=pairs)) == 0
+    pairs = replace(
+        images,
+        observation_start=2 * np.arange(n + 1),
+        observation_image=np.tile([0, 1], n),
+        observation_keypoint=np.zeros(2 * n, dtype=np.int64),
+    )
+    assert detection_offset(constant_network(), with_images(localization_map, pairs)) == 0
 
 
 def test_every_occlusion_model_has_its_own():
@@ -151,11 +158,11 @@ def test_all_scorers_of_a_map_use_it(tmp_path):
     views = localization_map.mapping_poses
     assert views is not None
     scorer = load_scorer(WEIGHTS / "set.safetensors", localization_map)
-    plain = load_scorer(WEIGHTS / "set.safetensors", replace(localization_map, images=None))
+    plain = load_scorer(WEIGHTS / "set.safetensors", with_images(localization_map, None))
     before, after = (one.report(views).expected_inliers for one in (plain, scorer))
     assert (after[before > 1] > 1.1 * before[before > 1]).all()
     load_scorer(WEIGHTS / "set.safetensors", localization_map.of_camera(NARROW))
-    assert localization_map.images is not None and len(localization_map.images.offsets) == 1  # estimated once
+    assert sum(isinstance(key, tuple) for key in localization_map.map.computed) == 1  # estimated once
     axes = views[:1, 2, :3]
     center = camera_centers(views[:1])
     expected = scorer.score(poses_looking_along(center, axes))
@@ -166,18 +173,19 @@ def test_all_scorers_of_a_map_use_it(tmp_path):
 
 def test_landmarks_without_an_image_are_those_of_the_smaller_model(tmp_path):
     folder = write_room(tmp_path / "sparse", metric=False)
-    images = LocalizationMap.from_colmap(folder, scale=1.0, up="z").images
-    assert images is not None and len(images) == 12
+    opened = Map.open(folder, frame=FrameOptions(scale=1.0, up="z"))
+    images = opened.images
+    assert images is not None and len(images.image_ids) == 12
     model = pycolmap.Reconstruction(str(folder))
     for number in (2, 3, 7, 8, 12):
         model.deregister_frame(model.images[number].frame_id)
     expected = load_colmap_landmarks(folder, reconstruction=model)
-    found = images.without(np.array([1, 2, 6, 7, 11]))
-    few = MappedImages.of(first_of(images.landmarks, 100), images.arrays, images.poses, images.cameras)
-    np.testing.assert_array_equal(
-        few.without(np.array([1, 2, 6, 7, 11])).ids, expected.ids[expected.ids <= few.landmarks.ids[-1]]
-    )
-    assert len(expected) < len(images.landmarks)
+    held_out = np.array([1, 2, 6, 7, 11])
+    found = opened.without(images, held_out)
+    few = select_points(images, images.point_ids <= images.point_ids[99])
+    left = expected.ids[expected.ids <= images.point_ids[99]]
+    np.testing.assert_array_equal(opened.without(few, held_out).ids, left)
+    assert len(expected) < len(opened.landmarks)
     np.testing.assert_array_equal(found.ids, expected.ids)
     np.testing.assert_array_equal(found.track_length, expected.track_length)
     for name in ("triangulation_angle_deg", "mapping_direction", "mapping_distance_m", "mapping_distance_spread"):

@@ -7,7 +7,7 @@ import pytest
 from scipy.special import expit, logit
 
 from selection.room import write_room
-from wheretolook.dataset.environment import ColmapEnvironment, ColmapFiles
+from wheretolook.dataset.scene import ColmapFiles, Scene
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.scorers.set.network import SetNetwork
 from wheretolook.scorers.weights import load_scorer
@@ -28,7 +28,7 @@ def test_the_offset_is_added_once_and_only_for_photographs(rendered, tmp_path):
     expected = 0.0 if rendered else 0.7
     for localization_map in (
         LocalizationMap.from_colmap(folder),
-        ColmapEnvironment(ColmapFiles(folder)).localization_map,
+        Scene.of_colmap(ColmapFiles(folder)).localization_map,
     ):
         views = localization_map.mapping_poses
         assert views is not None

@@ -8,6 +8,7 @@ from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.landmarks import Landmarks, max_cosine_to_other
+from wheretolook.mapping.map import Map
 from wheretolook.scorers.weights import load_scorer
 
 CAMERA = PinholeCamera(320, 240, 160.0)
@@ -47,7 +48,7 @@ def two_walls(n, seed):
 def test_a_wall_that_repeats_its_texture_is_not_the_one_to_look_at(n, seed):
     landmarks = two_walls(n, seed)
     views = poses_looking_along([[0, 0, 1.3]] * 2, [[-1.0, 0, 0], [1.0, 0, 0]])
-    localization_map = LocalizationMap(landmarks, CAMERA)
+    localization_map = LocalizationMap(Map(landmarks), CAMERA)
     visible = localization_map.landmarks_in_view(views)
     assert len(visible[0]) == len(visible[1]) == n
     assert np.median(landmarks.ambiguity[visible[1]]) > np.median(landmarks.ambiguity[visible[0]]) + 0.1
@@ -59,7 +60,7 @@ def test_a_wall_that_repeats_its_texture_is_not_the_one_to_look_at(n, seed):
 def test_a_wall_mapped_from_one_side_is_best_seen_from_that_side(n):
     both = two_walls(n, seed=1)
     left = {name: None if value is None else value[:n] for name, value in vars(both).items()}
-    localization_map = LocalizationMap(Landmarks(**left), CAMERA)
+    localization_map = LocalizationMap(Map(Landmarks(**left)), CAMERA)
     views = poses_looking_along([[0, 0, 1.3], [-4.0, 0, 1.3]], [[-1.0, 0, 0], [1.0, 0, 0]])
     assert np.diff(localization_map.landmarks_in_view(views).starts).tolist() == [n, n]
     scores = load_scorer(localization_map).score(views)

@@ -16,6 +16,7 @@ import wheretolook
 from synthetic_dataset import CAMERA, make_landmarks
 from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.inputs.localization_map import LocalizationMap
+from wheretolook.mapping.map import Map
 from wheretolook.scorers import registry
 from wheretolook.scorers.registry import all_methods, make_scorer, methods_named, scorers
 from wheretolook.scorers.visible import METHODS
@@ -217,7 +218,9 @@ def test_an_attribute_that_maps_do_not_know_is_named(tmp_path):
     header.pop("format_version")
     header["attributes"] = ["colour" if name == "ambiguity" else name for name in header["attributes"]]
     write_weights(tmp_path / "set.safetensors", "set", tensors, header)
-    localization_map = LocalizationMap(make_landmarks(np.random.default_rng(0), 20), replace(CAMERA, focal_px=80.0))
+    localization_map = LocalizationMap(
+        Map(make_landmarks(np.random.default_rng(0), 20)), replace(CAMERA, focal_px=80.0)
+    )
     with pytest.raises(WeightsError):
         load_scorer(tmp_path / "set.safetensors", localization_map)
     views = poses_looking_along(np.zeros((1, 3)), np.ones((1, 3)))
@@ -226,7 +229,7 @@ def test_an_attribute_that_maps_do_not_know_is_named(tmp_path):
 
 def test_weights_of_many_cameras_come_before_those_of_one(tmp_path):
     """Precision on views of many cameras is lower than on those of one, and does not rank weights."""
-    localization_map = LocalizationMap(make_landmarks(np.random.default_rng(0), 50), CAMERA)
+    localization_map = LocalizationMap(Map(make_landmarks(np.random.default_rng(0), 50)), CAMERA)
     for name in ("set", "matchability", "mlp-2d+z"):
         for suffix in ("safetensors", "json"):
             shutil.copy(WEIGHTS / f"{name}.{suffix}", tmp_path)
@@ -250,6 +253,7 @@ from pathlib import Path
 from synthetic_dataset import CAMERA, make_landmarks
 from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.inputs.localization_map import LocalizationMap
+from wheretolook.mapping.map import Map
 from wheretolook.mapping.landmarks import MAP_ATTRIBUTES
 from wheretolook.scorers.registry import make_scorer
 from wheretolook.scorers.weights import load_scorer
@@ -257,8 +261,8 @@ from wheretolook.scorers.weights import load_scorer
 weights, out = Path(sys.argv[1]), Path(sys.argv[2])
 rng = np.random.default_rng(1)
 views = poses_looking_along(rng.uniform((-1, -1, 1), (1, 1, 2), (40, 3)), rng.normal(size=(40, 3)))
-at = LocalizationMap(make_landmarks(np.random.default_rng(0), 200), CAMERA)
-wide = LocalizationMap(at.landmarks, type(CAMERA)(640, 480, 320.0))
+at = LocalizationMap(Map(make_landmarks(np.random.default_rng(0), 200)), CAMERA)
+wide = LocalizationMap(at.map, type(CAMERA)(640, 480, 320.0))
 scores = {name: load_scorer(weights / f"{name}.safetensors", wide).score(views) for name in ("set", "mlp-2d+z")}
 scores["expected"] = make_scorer("expected-bins", wide, weights=weights / "matchability.safetensors").score(views)
 scores["n_attributes"] = np.array([len(MAP_ATTRIBUTES)])

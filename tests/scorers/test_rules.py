@@ -8,6 +8,7 @@ from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.lattices import fibonacci_sphere
 from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.inputs.localization_map import LocalizationMap
+from wheretolook.mapping.map import Map
 from wheretolook.scorers.forward import ForwardScorer
 from wheretolook.scorers.registry import make_scorer
 
@@ -16,7 +17,7 @@ CAMERA = PinholeCamera(320, 320, 277.0)
 
 @pytest.fixture
 def localization_map():
-    return LocalizationMap(make_landmarks(np.random.default_rng(0), 400), CAMERA)
+    return LocalizationMap(Map(make_landmarks(np.random.default_rng(0), 400)), CAMERA)
 
 
 def test_forward_prefers_the_heading(localization_map):

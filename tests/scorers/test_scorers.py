@@ -15,6 +15,7 @@ from wheretolook.inputs.channels import ALL_CHANNELS, CHANNELS
 from wheretolook.inputs.landmark_features import ATTRIBUTES, LandmarkDescriber
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.inputs.statistics import FeatureStatistics
+from wheretolook.mapping.map import Map
 from wheretolook.scorers.adapted.score import AdaptedNetwork
 from wheretolook.scorers.base import Scorer
 from wheretolook.scorers.bins import BinsScorer
@@ -35,7 +36,7 @@ from wheretolook_paper.scorers.trees.learn import PooledViews, fit_trees
 @pytest.fixture
 def localization_map():
     landmarks = make_landmarks(np.random.default_rng(0), 200)
-    return LocalizationMap(landmarks, CAMERA, mapping_poses=make_mapping_poses(0))
+    return LocalizationMap(Map(landmarks, mapping_poses=make_mapping_poses(0)), CAMERA)
 
 
 @pytest.fixture
@@ -109,7 +110,7 @@ def test_scorers_keep_their_contract(name, localization_map, views, weights, mon
     np.testing.assert_allclose(scorer.score(views), scores, rtol=rtol)
     assert scorer.score(views[:0]).shape == (0,)
     unknown = replace(localization_map.landmarks, ambiguity=np.full(200, np.nan, np.float32))
-    without_ambiguity = replace(localization_map, landmarks=unknown)
+    without_ambiguity = replace(localization_map, map=replace(localization_map.map, landmarks=unknown))
     assert np.isfinite(make_scorer(name, without_ambiguity, seed=3, weights=weights).score(views)).all()
     invalid = views.copy()
     invalid[3, 1, 2] = np.nan
@@ -163,7 +164,7 @@ def test_learned_scores_equal_the_network_by_hand(localization_map, views, weigh
 
 def test_another_resolution_of_the_same_field_of_view_scores_the_same(localization_map, views, weights):
     double = PinholeCamera(2 * CAMERA.width, 2 * CAMERA.height, 2 * CAMERA.focal_px)
-    scores = load_scorer(weights, LocalizationMap(localization_map.landmarks, double)).score(views)
+    scores = load_scorer(weights, LocalizationMap(Map(localization_map.landmarks), double)).score(views)
     np.testing.assert_allclose(scores, load_scorer(weights, localization_map).score(views), rtol=1e-5)
 
 

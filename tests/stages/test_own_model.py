@@ -21,15 +21,15 @@ from wheretolook.commands.options import MapUseOptions, ScenesConfig, extractor_
 from wheretolook.commands.plan import Plan
 from wheretolook.commands.sample import Sample
 from wheretolook.commands.viewpoint_map import BuildViewpointMap
-from wheretolook.dataset.environment import SceneEnvironment
 from wheretolook.dataset.layout import Dataset, SceneFolder
 from wheretolook.dataset.sampling_config import SampleConfig
+from wheretolook.dataset.scene import Scene
 from wheretolook.features.config import ExtractorConfig
 from wheretolook.geometry.camera import CameraConfig, PinholeCamera
 from wheretolook.geometry.poses import camera_centers, poses_looking_along
 from wheretolook.geometry.views import Views
 from wheretolook.mapping.colmap_model import colmap_poses, read_model
-from wheretolook.mapping.config import ExistingModelConfig, FrameOptions, MapConfig, MarkerConfig, PhotographsConfig
+from wheretolook.mapping.config import FrameOptions, ImportConfig, MarkerConfig, PhotographsConfig
 from wheretolook.mapping.imported_map import map_existing
 from wheretolook.planning.config import PathConfig, PlanConfig, ViewpointMapConfig
 from wheretolook.rendering.raycasting import MeshRaycaster
@@ -89,7 +89,7 @@ def experiment_of(model: Path, data: Path, **existing: object) -> AllOptions:
         data=data,
         device="cpu",
         scenes=ScenesConfig(mapped_space=MappedSpaceConfig(max_camera_distance_m=0.6)),
-        mapping=MapConfig(existing=ExistingModelConfig(model, **existing), frame=FrameOptions(scale=1)),  # type: ignore[arg-type]
+        source={"model": model, "scale": 1, **existing},
         sample=SampleConfig(grid=(6, 5, 3), directions=40, keep=10, max_locations=6),
         viewpoint_map=ViewpointMapConfig(grid=(6, 5, 3), directions=30, method="visible"),
         tracking=TrackingConfig(str(data / "mlruns")),
@@ -109,7 +109,7 @@ def test_from_a_model_to_a_planned_path(tmp_path, with_mesh):
     (scene,) = Dataset.load(tmp_path / "data" / "mine").scenes
     assert scene.name == "flat" and scene.camera == LOOKS and scene.own_camera
     assert scene.is_photographed is not with_mesh and len(scene.read_landmarks()) == n_points
-    assert SceneEnvironment(scene).has_photographs  # of the model, whose mesh is not what was mapped
+    assert Scene(scene).map.has_photographs  # of the model, whose mesh is not what was mapped
     np.testing.assert_allclose(scene.mapping_poses(), colmap_poses(folder), atol=1e-6)
 
     run(Sample, experiment)
@@ -177,11 +177,11 @@ def test_a_scene_is_replaced_by_no_other_source(tmp_path):
     content = (scene.map / "points3D.bin").read_bytes()
     other = save(room_model(cameras=(OTHER,)), tmp_path / "other" / "flat")
     (tmp_path / "photos" / "flat").mkdir(parents=True)
-    photographs = MapConfig(photographs=PhotographsConfig(tmp_path / "photos" / "flat"))
+    photographs = {"photographs": PhotographsConfig(tmp_path / "photos" / "flat")}
     for experiment in (
         experiment_of(other, data),
-        replace(experiment_of(other, data), mapping=photographs),
-        experiment_of(scene.map, data, name=scene.name),  # the scene's own map
+        replace(experiment_of(other, data), source=photographs),
+        experiment_of(scene.map, data, scene=scene.name),  # the scene's own map
     ):
         with pytest.raises(ConfigError, match=r"made from another source|would be replaced"):
             run(Map, experiment)
@@ -204,7 +204,7 @@ def test_one_of_several_cameras_is_chosen(tmp_path):
         run(Sample, experiment_of(folder, tmp_path / "data"))
     # each model that joins the dataset keeps its own camera
     experiment = experiment_of(save(room_model(), tmp_path / "second"), tmp_path / "more")
-    run(Map, replace(experiment, mapping=experiment_of(folder, tmp_path / "more", camera_id=2).mapping))
+    run(Map, replace(experiment, source=experiment_of(folder, tmp_path / "more", camera_id=2).source))
     scenes = run(Map, experiment).scenes
     assert [(scene.name, scene.camera) for scene in scenes] == [("flat", OTHER), ("second", LOOKS)]
     run(Sample, experiment)
@@ -216,20 +216,20 @@ def test_a_turned_and_scaled_model_warns_and_is_aligned(tmp_path):
     centers = camera_centers(colmap_poses("", model))
     turn = pycolmap.Rotation3d(np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]))
     model.transform(pycolmap.Sim3d(37.0, turn, np.array([5.0, 0, 0])))
-    existing = ExistingModelConfig(save(model, tmp_path / "flat"))
+    flat = save(model, tmp_path / "flat")
     metric = FrameOptions(scale=1, up="z")
     with pytest.warns(MapWarning) as warned:
-        map_existing(MapConfig(existing=existing, frame=metric), tmp_path / "map", tmp_path / "work")
+        map_existing(ImportConfig(model=flat, frame=metric), tmp_path / "map", tmp_path / "work")
     assert len([warning for warning in warned if warning.category is MapWarning]) == 2
 
     distance = ("000.jpg", "018.jpg", float(np.linalg.norm(centers[0] - centers[18])))
     table = tmp_path / "positions.csv"
     table.write_text("image,x,y,z\n" + "".join(f"{i:03d}.jpg,{x},{y},{z}\n" for i, (x, y, z) in enumerate(centers)))
-    markers = PhotographsConfig(scale=MarkerConfig(marker_size_m=0.4))
+    markers = MarkerConfig(marker_size_m=0.4)
     with pytest.raises(ConfigError):  # no photographs to detect markers in
-        map_existing(MapConfig(existing=existing, photographs=markers), tmp_path / "map", tmp_path / "work")
+        map_existing(ImportConfig(model=flat, scale=markers), tmp_path / "map", tmp_path / "work")
     for frame in (FrameOptions(distance=distance, up="level"), FrameOptions(positions=table)):
-        config = MapConfig(existing=existing, frame=frame)
+        config = ImportConfig(model=flat, frame=frame)
         map_existing(config, tmp_path / "map", tmp_path / "work")  # warnings are errors here
         report = json.loads((tmp_path / "map" / "report.json").read_text())
         assert report["scale"]["factor"] == pytest.approx(1 / 37)
@@ -252,11 +252,8 @@ def test_landmarks_are_triangulated_again_at_known_poses(tmp_path):
         image = pycolmap.Image(name=f"photo-{index:02d}.png", camera_id=5, image_id=100 - index)
         model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pose))
     folder = save(model, tmp_path / "flat")
-    config = MapConfig(
-        existing=ExistingModelConfig(folder),
-        frame=FrameOptions(up="z"),
-        photographs=PhotographsConfig(tmp_path / "photos", scale=MarkerConfig(marker_size_m=MARKERS[0].size_m)),
-    )
+    markers = MarkerConfig(marker_size_m=MARKERS[0].size_m)
+    config = ImportConfig(tmp_path / "photos", scale=markers, model=folder, frame=FrameOptions(up="z"))
     report = map_existing(config, tmp_path / "map", tmp_path / "work", progress=False)
     assert report.triangulated_anew and report.has_descriptors and report.n_points == 0
     assert report.scale.source == "markers" and report.scale.factor == pytest.approx(1, abs=0.005)

@@ -12,8 +12,9 @@ import pandas as pd
 import pycolmap
 import pytest
 
+from fixed_fields import FAST, main, with_fields
 from mask_agreement import MaskAgreement
-from wheretolook.cli import main, parse_command
+from wheretolook.cli import parse_command
 from wheretolook.commands.options import open_scene
 from wheretolook.dataset.layout import Dataset
 from wheretolook.dataset.viewpoint_files import read_table
@@ -40,20 +41,19 @@ camera: {width: 320, height: 240, focal_px: 160}
 scenes:
   train: 1
   test: 1
-  apartment: {n_rooms: 3, area_m2: 26, texture_size: 1024, texels_per_m: 40, light_spacing_m: 0.5, light_rays: 4}
 mapping: {n_images: 24}
 sample: {grid: [6, 6, 4], directions: 100, keep: 50, max_locations: 8, max_directions: 5}
 label: {workers: 1, shard_size: 20}
-train: {val_fraction: 0.3, methods: [mlp-2d, mlp-2d+3d, set], mlp: {epochs: 2}, set: {epochs: 2, batch_size: 1}}
-evaluate: {resamples: 20, top_n: [1], methods: [random, visible, bins, fisher-trace-exact, mlp, set]}
+train: {methods: [mlp-2d, mlp-2d+3d, set], mlp: {epochs: 2}, set: {epochs: 2, batch_size: 1}}
+evaluate: {methods: [random, visible, bins, fisher-trace-exact, mlp, set]}
 """
 
 
-def run(stage: str, folder: Path, *options: str) -> int:
-    return main(
-        [stage, "--config", str(folder / "tiny.yaml"), "--data", str(folder / "data"),
-         "--tracking.folder", str(folder / "mlruns"), "--device", "cpu", *options]
-    )  # fmt: skip
+def run(stage: str, folder: Path, *options: str, **fields: object) -> int:
+    """Run a stage with options, and fields of its dataclasses by their names with __ for points."""
+    where = ["--config", str(folder / "tiny.yaml"), "--data", str(folder / "data"), "--device", "cpu"]
+    values = {name.replace("__", "."): value for name, value in fields.items()}
+    return main([stage, *where, "--tracking.folder", str(folder / "mlruns"), *options], {**FAST, **values})
 
 
 @pytest.fixture(scope="module")
@@ -195,7 +195,7 @@ def test_views_of_changed_scenes_are_labelled_and_removed_again(copy: Path) -> N
 def test_only_scenes_that_these_options_generate_can_change(copy: Path, capsys: pytest.CaptureFixture[str]) -> None:
     scene, *_ = Dataset.load(copy / "data" / "tiny").scenes
     before = scene.table.read_bytes()
-    assert run("label", copy, "--label.changes", "0.8", "--scenes.apartment.clutter", "0.3") == 2
+    assert run("label", copy, "--label.changes", "0.8", scenes__apartment__clutter=0.3) == 2
     assert "generated with these options" in capsys.readouterr().err
     assert scene.table.read_bytes() == before and not (scene.folder / "changed.glb").exists()
 
@@ -265,7 +265,7 @@ def test_viewpoints_can_be_sampled_with_every_occlusion_model(copy: Path, model:
     scene = Dataset.load(copy / "data" / "tiny").scenes[0]
     by_mesh = StoredOcclusion.load(scene.occlusion)
     assert by_mesh.name == "mesh"
-    assert run("sample", copy, "--occlusion.model", model, "--occlusion.voxel_m", "0.04") == 0
+    assert run("sample", copy, "--occlusion.model", model, occlusion__voxel_m=0.04) == 0
     stored = StoredOcclusion.load(scene.occlusion)
     assert stored.name == model
     if model == "none":
@@ -282,7 +282,7 @@ def test_a_stage_refuses_outdated_inputs(copy: Path, capsys: pytest.CaptureFixtu
     before = mesh.stat().st_mtime_ns
     assert run("scenes", copy, "--camera.focal_px", "200") == 0
     assert mesh.stat().st_mtime_ns == before  # another camera does not change a mesh
-    assert run("scenes", copy, "--scenes.apartment.texture_richness", "0.3") == 0
+    assert run("scenes", copy, scenes__apartment__texture_richness=0.3) == 0
     for stage, needed in (("label", "sample"), ("sample", "map"), ("evaluate", "label")):
         assert run(stage, copy) == 2
         assert f"Run `wheretolook {needed}`" in capsys.readouterr().err
@@ -297,13 +297,13 @@ def test_weights_are_not_tested_on_scenes_they_were_trained_on(copy: Path) -> No
     assert run("evaluate", copy) == 2
 
 
-PATHS = ["--paths.grid", "[4, 4, 2]", "--paths.directions", "40", "--paths.min_distance_m", "1", "--paths.max_turn_deg",
-         "60", "--paths.planner.time_s", "1", "--paths.planner.spacing_m", "0.5"]  # fmt: skip
+PATHS = ["--grid", "[4, 4, 2]", "--directions", "40", "--max-turn-deg", "60", "--planner.time_s", "1",
+         "--planner.spacing_m", "0.5"]  # fmt: skip
 
 
 def test_planned_paths_are_rendered_and_localized(copy: Path, capsys: pytest.CaptureFixture[str]) -> None:
     options = ["--paths.pairs", "2", "--paths.methods", "[forward,visible]", *PATHS]
-    assert run("compare-paths", copy, *options) == 0
+    assert run("compare-paths", copy, *options, paths__min_distance_m=1) == 0
     root = copy / "data" / "tiny" / "results"
     table = pd.read_csv(root / "paths.csv")
     assert {*table["method"]} == {"forward", "visible", "visible greedy"} and {*table["pairs"]} == {2}
@@ -315,10 +315,10 @@ def test_planned_paths_are_rendered_and_localized(copy: Path, capsys: pytest.Cap
     assert (root / "paths.png").stat().st_size > 5000
     before = (root / "paths" / "views.parquet").read_bytes()
     capsys.readouterr()
-    assert run("compare-paths", copy, *options) == 0
+    assert run("compare-paths", copy, *options, paths__min_distance_m=1) == 0
     assert "reusing" in capsys.readouterr().out and (root / "paths" / "views.parquet").read_bytes() == before
     assert len(list(finished_runs(TrackingConfig(str(copy / "mlruns")), "paths"))) == 1  # nothing new to log
-    assert run("compare-paths", copy, "--paths.scenes", "[nowhere]") == 2
+    assert run("compare-paths", copy, "--paths.scenes", "[nowhere]", paths__min_distance_m=1) == 2
 
 
 def test_a_camera_at_an_unknown_pose_turns_until_it_is_localized(copy: Path) -> None:
@@ -333,18 +333,18 @@ def test_a_camera_at_an_unknown_pose_turns_until_it_is_localized(copy: Path) -> 
     pd.testing.assert_frame_equal(*(first[first["policy"] == name].drop(columns="policy") for name in ("even", "gain")))
     assert len(list(finished_runs(TrackingConfig(str(copy / "mlruns")), "relocalize"))) == 1
     kept = {path: path.stat().st_mtime_ns for path in (root / "relocalize").glob("*/poses.parquet")}
-    assert run("relocalize", copy, *options, "--confidence", "0.5") == 0
+    assert run("relocalize", copy, *options, confidence=0.5) == 0
     assert {path: path.stat().st_mtime_ns for path in kept} == kept
     assert run("relocalize", copy, "--policies", "[forward]") == 2
 
 
 def test_views_along_paths_are_localized_together(copy: Path) -> None:
     options = ["--paths.pairs", "1", "--paths.methods", "[forward,set]", *PATHS]
-    assert run("compare-paths", copy, *options) == 0
+    assert run("compare-paths", copy, *options, paths__min_distance_m=1) == 0
     root = copy / "data" / "tiny" / "results"
     plain = pd.read_csv(root / "paths.csv")
     joint = ["--paths.stops.looks", "3", "--paths.stops.least_score", "0.95", "--paths.last_views", "2"]
-    assert run("compare-paths", copy, *options, *joint) == 0
+    assert run("compare-paths", copy, *options, *joint, paths__min_distance_m=1) == 0
     table = pd.read_csv(root / "paths.csv")
     more = {"set with stops", "forward last 2 together", "set last 2 together"}
     assert {*table["method"]} == {*plain["method"], *more}
@@ -355,9 +355,14 @@ def test_views_along_paths_are_localized_together(copy: Path) -> None:
     further = pd.read_parquet(next((root / "paths").glob("*/stops.parquet")))
     assert (stopped["looks"] * stopped["views"]).sum() == pytest.approx(stopped["views"].sum() + len(further), rel=1e-4)
     kept = {path: path.stat().st_mtime_ns for path in (root / "paths").glob("*/*.parquet")}
-    assert run("compare-paths", copy, *options) == 0  # reuses the views localized with more options
+    assert (
+        run("compare-paths", copy, *options, paths__min_distance_m=1) == 0
+    )  # reuses the views localized with more options
     assert {path: path.stat().st_mtime_ns for path in kept} == kept
-    assert run("compare-paths", copy, *options, "--paths.methods", "[forward,visible]", *joint) == 2
+    assert (
+        run("compare-paths", copy, *options, "--paths.methods", "[forward,visible]", *joint, paths__min_distance_m=1)
+        == 2
+    )
 
 
 def test_a_path_is_planned_and_shown(copy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -385,7 +390,7 @@ def test_a_path_is_planned_and_shown(copy: Path, tmp_path: Path, monkeypatch: py
 def test_depth_images_bound_the_free_space(copy: Path) -> None:
     """With the occlusion model tsdf; locations are sampled by the mesh all the same."""
     where = ["--config", str(copy / "tiny.yaml"), "--data", str(copy / "data"), "--device", "cpu"]
-    experiment = parse_command("plan", [*where, "--occlusion.model", "tsdf", "--occlusion.voxel_m", "0.04"])
+    experiment = with_fields(parse_command("plan", [*where, "--occlusion.model", "tsdf"]), {"occlusion.voxel_m": 0.04})
     environment = open_scene(experiment, Dataset.load(experiment.root).split("test")[0])
     by_mesh = environment.sampled_space
     assert type(by_mesh) is FreeSpace and isinstance(environment.space, TsdfSpace)

@@ -68,7 +68,7 @@ def leave_posix() -> None:
 leave_posix()
 
 if __name__ == "__main__":
-    from wheretolook.cli import main
+    from fixed_fields import main
 
     for command in json.loads(sys.argv[1]):
         if command[0] == "train":

@@ -26,12 +26,11 @@ camera: {width: 320, height: 240, focal_px: 160}
 scenes:
   train: 1
   test: 1
-  apartment: {n_rooms: 3, area_m2: 26, texture_size: 1024, texels_per_m: 40, light_spacing_m: 0.5, light_rays: 4}
 mapping: {n_images: 24}
 sample: {grid: [6, 6, 4], directions: 100, keep: 50, max_locations: 8, max_directions: 5}
 label: {workers: 2, shard_size: 20}
-train: {val_fraction: 0.3, methods: [mlp-2d], mlp: {epochs: 2}}
-evaluate: {resamples: 20, top_n: [1], methods: [random, visible, mlp]}
+train: {methods: [mlp-2d], mlp: {epochs: 2}}
+evaluate: {methods: [random, visible, mlp]}
 """
 
 

@@ -26,8 +26,8 @@ from wheretolook.commands.options import (
     scene_job,
 )
 from wheretolook.dataset.dataset_lock import reading
-from wheretolook.dataset.environment import ColmapEnvironment, ColmapFiles, SceneEnvironment
 from wheretolook.dataset.layout import Dataset, SceneFolder, views_by_camera
+from wheretolook.dataset.scene import ColmapFiles, Scene
 from wheretolook.mapping.config import FrameOptions, place_name
 from wheretolook.scorers.weights import load_scorer, resolve_weights
 from wheretolook.tracking import TrackingConfig, check_store, kept_if_not_logged
@@ -126,10 +126,8 @@ class Adapt(SceneOptions, LabelOptions, FrameOptions):
         tracking: where MLflow keeps its runs.
     """
 
-    SHORT: ClassVar = {
-        **{name: f"adapt.{name}" for name in ("scene", "map", "images", "database", "weights", "out", "minutes")},
-        "engine": "label.engine",
-    }
+    SHORT: ClassVar = {"engine": "label.engine"}
+    GROUPS: ClassVar = {"adapt": ""}
 
     adapt: AdaptConfig = field(default_factory=AdaptConfig)
     tracking: TrackingConfig = field(default_factory=TrackingConfig)
@@ -180,7 +178,7 @@ class Adapt(SceneOptions, LabelOptions, FrameOptions):
                     log(f"{files.name}: its photographs are not used: {error}")
             assert views is not None
             _check_enough(views, files.map if table is None else files.table)
-            whole = scene.localization_map if scene.has_photographs else files.localization_map(device=scene.device)
+            whole = scene.localization_map if scene.map.has_photographs else files.localization_map(device=scene.device)
             return self._fit(target, views, whole, log, progress)
 
     def _adapt_map(self, model: Path, log: Log, progress: Progress) -> Path | None:
@@ -195,8 +193,8 @@ class Adapt(SceneOptions, LabelOptions, FrameOptions):
         reconstruction = read_model(model)
         frame = find_frame(model, reconstruction, self.frame_options())
         log(f"{name}: {'; '.join((frame.describe(), *frame.doubts))}")
-        environment = ColmapEnvironment(ColmapFiles(model), occlusion=occlusion, device=self.warp_device)
-        views, whole = self._held_out(model, name, environment.occlusion, target.weights, log)
+        scene = Scene.of_colmap(ColmapFiles(model), occlusion=occlusion, device=self.warp_device)
+        views, whole = self._held_out(model, name, scene.occlusion, target.weights, log)
         _check_enough(views, model)
         with hold(target.path.with_name(f".{target.path.name}.lock"), "adapt"):
             return self._fit(target, views, whole, log, progress)
@@ -283,9 +281,7 @@ class Adapt(SceneOptions, LabelOptions, FrameOptions):
             for path in (target.path.with_suffix(".md"), *([target.path] if is_better else [])):
                 client.log_artifact(run, str(path))
 
-    def _labelled(
-        self, files: SceneFolder, scene: SceneEnvironment, has_photographs: bool, log: Log
-    ) -> pd.DataFrame | None:
+    def _labelled(self, files: SceneFolder, scene: Scene, has_photographs: bool, log: Log) -> pd.DataFrame | None:
         """Return the scene's labelled viewpoints: all if `label` has run, else those that the time allows.
 
         None where there are only photographs.
@@ -306,7 +302,7 @@ class Adapt(SceneOptions, LabelOptions, FrameOptions):
         fix = "Give --database or --images, the map's photographs, or use the bundled weights."
         raise SceneError(problem, path=files.folder, fix=fix)
 
-    def _label(self, files: SceneFolder, scene: SceneEnvironment, log: Log) -> pd.DataFrame:
+    def _label(self, files: SceneFolder, scene: Scene, log: Log) -> pd.DataFrame:
         """Label views for `adapt.minutes`, one location after the other in random order; a later run continues."""
         import pandas as pd
 
@@ -349,7 +345,7 @@ def _scene(dataset: Dataset, name: str) -> SceneFolder:
     return dataset.scenes[0]
 
 
-def labelled_views(files: SceneFolder, scene: SceneEnvironment, table: pd.DataFrame, weights: Path) -> LocalizedViews:
+def labelled_views(files: SceneFolder, scene: Scene, table: pd.DataFrame, weights: Path) -> LocalizedViews:
     """Return the labelled views of a scene with the log-odds that the weights give them."""
     from wheretolook.dataset.viewpoint_table import is_good, poses
     from wheretolook.geometry.poses import camera_centers
@@ -359,7 +355,7 @@ def labelled_views(files: SceneFolder, scene: SceneEnvironment, table: pd.DataFr
     cam_from_world = poses(table)
     log_odds = np.empty(len(table))
     for camera, rows in views_by_camera(files, table):
-        own = scene.localization_map.of_camera(camera) if scene.has_photographs else None
+        own = scene.localization_map.of_camera(camera) if scene.map.has_photographs else None
         scorer = load_scorer(weights, own or files.localization_map(camera, scene.device))
         with warnings.catch_warnings():  # how accurate the weights are here is what is measured
             warnings.simplefilter("ignore", OutOfRangeWarning)

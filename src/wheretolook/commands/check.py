@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 def knows_photographs(files: SceneFolder, images: Path | None = None, database: Path | None = None) -> bool:
     """Return whether the photographs that a scene's map was made from, or their features, are known."""
     from wheretolook.mapping.colmap_model import holds_model
-    from wheretolook.mapping.mapped_images import find_features, find_photographs
+    from wheretolook.mapping.map import find_features, find_photographs
 
     return holds_model(files.map) and any((images, database, find_features(files.map), find_photographs(files.map)))
 
@@ -189,9 +189,9 @@ class Check(OcclusionOptions, ScorerOptions, FrameOptions):
         self, scene: SceneFolder | None, work: Path, device: str, workers: int
     ) -> tuple[PhotographedMap, OcclusionModel]:
         """Open the map with its photographs' features, and the occlusion model; results go to `work`."""
-        from wheretolook.dataset.environment import ColmapEnvironment, ColmapFiles
+        from wheretolook.dataset.scene import ColmapFiles, Scene
         from wheretolook.holdout.photo_map import features_of, open_map
-        from wheretolook.mapping.mapped_images import find_features, find_photographs
+        from wheretolook.mapping.map import find_features, find_photographs
 
         mesh = self.mesh
         model = self.map if scene is None else scene.map
@@ -210,5 +210,5 @@ class Check(OcclusionOptions, ScorerOptions, FrameOptions):
         photographs = replace(open_map(folder, features, name, frame, model), fov_deg=self.fov)
         files = ColmapFiles(model, mesh=mesh, frame=frame)
         camera_id = next(iter(photographs.model.cameras))  # occlusion depends on none
-        environment = ColmapEnvironment(files, camera_id, self.occlusion or "", device=device)
-        return photographs, environment.occlusion
+        opened = Scene.of_colmap(files, camera_id, self.occlusion, device=device)
+        return photographs, opened.occlusion

@@ -50,7 +50,7 @@ class Demo(Experiment):
     """
 
     CONFIG: ClassVar = "demo"
-    SHORT: ClassVar = {"engine": "label.engine", "images": "mapping.photographs.images"}
+    SHORT: ClassVar = {"engine": "label.engine"}
 
     train: TrainConfig = field(default_factory=TrainConfig)
     evaluate: EvaluateConfig = field(default_factory=EvaluateConfig)

@@ -63,18 +63,18 @@ class Export(CameraOptions, FrameOptions):
 
     def run(self) -> None:
         """Write the robot's folder."""
-        from wheretolook.dataset.environment import ColmapEnvironment, ColmapFiles
+        from wheretolook.dataset.scene import ColmapFiles, Scene
         from wheretolook.robot.export import export_robot, pinhole_of
         from wheretolook.scorers.weights import load_scorer, resolve_weights
         from wheretolook.select.waypoints import grid_waypoints
 
         files = ColmapFiles(self.map, mesh=self.mesh, database=self.database, frame=self.frame_options())
         occlusion = "none" if self.mesh is None else "mesh"
-        environment = ColmapEnvironment(files, self.named_camera(), occlusion=occlusion)
-        source = environment.localization_map
+        scene = Scene.of_colmap(files, self.named_camera(), occlusion=occlusion)
+        source = scene.localization_map
         locations = None
         if self.mesh is not None:
-            locations = grid_waypoints(source, environment.mesh_space, self.spacing).points
+            locations = grid_waypoints(source, scene.mesh_space, self.spacing).points
             if len(locations) > MAX_LOCATIONS:
                 problem = f"the grid has {len(locations):,} free locations, more than {MAX_LOCATIONS:,}"
                 raise ConfigError(problem, value=self.spacing, fix="Give a larger --spacing.")

@@ -31,16 +31,16 @@ from wheretolook.commands.options import (
 from wheretolook.dataset.dataset_lock import changes_dataset
 from wheretolook.dataset.layout import Dataset, SceneFolder
 from wheretolook.geometry.camera import Camera, CameraConfig, PinholeCamera, describe_camera, draw_camera
-from wheretolook.mapping.config import ExistingModelConfig, FrameOptions, MapConfig, place_name
+from wheretolook.mapping.config import FrameOptions, ImportConfig, MapConfig, PhotographsConfig, place_name
 from wheretolook.mapping.georeference import read_scale
+from wheretolook.mapping.map import source_of_map
 from wheretolook.mapping.map_frame import read_frame
-from wheretolook.mapping.mapped_images import source_of_map
 from wheretolook.utils.errors import ConfigError, MapError, SceneError, reject
 from wheretolook.utils.files import cache_key, check_folder_name, fingerprint, path_within, size_and_time
 
 
 @dataclass(frozen=True, kw_only=True)
-class Map(SceneOptions, LabelOptions):
+class Map(SceneOptions, LabelOptions, FrameOptions):
     """Build a COLMAP map of every scene from renders, or of photographs: --images. Or import one: --model.
 
     A model of your own, from COLMAP or hloc, becomes a scene for sample, viewpoint-map and plan, in metres with z up
@@ -52,37 +52,97 @@ class Map(SceneOptions, LabelOptions):
       wheretolook map --name mymap --model sparse/0 --mesh scan.glb --database database.db
 
     Args:
-        mapping: what is mapped, and how.
+        mapping: maps of renders.
+        photographs: maps of photographs, and the images and markers of a model.
+        model: folder of a COLMAP model to import.
+        mesh: textured mesh of the scene in the model's frame, for free space, occlusion and labels. Without one, free
+            space follows `scenes.mapped_space`, and occlusion hidden-point removal.
+        mesh_up: which axis of the mesh's file is the model's z: x, y or z, with a minus sign if it points down.
+        database: the COLMAP database that the model was built from, or hloc's features in HDF5.
+        camera_id: the query camera, if the model has several and `camera` names none.
+        scene: name of the scene of photographs or of a model; by default that of the folder, and for sparse/0, images
+            and the like that of the parent folder.
     """
 
     SHORT: ClassVar = {
         "images": "mapping.photographs.images",
-        "model": "mapping.existing.model",
-        "mesh": "mapping.existing.mesh",
-        "database": "mapping.existing.database",
-        "camera-id": "mapping.existing.camera_id",
-        **{name: f"mapping.frame.{name}" for name in ("scale", "distance", "positions", "up")},
         "engine": "label.engine",
+        **{f"mapping.existing.{name}": name for name in ("model", "mesh", "mesh_up", "database", "camera_id")},
+        **{f"mapping.frame.{name}": name for name in ("scale", "distance", "positions", "up")},
+        "mapping.existing.name": "scene",
+        "mapping.photographs.name": "scene",
     }
+    GROUPS: ClassVar = {"photographs": "mapping.photographs."}
 
     mapping: MapConfig = field(default_factory=MapConfig)  # type: ignore[assignment]
+    photographs: PhotographsConfig = field(default_factory=PhotographsConfig)
+    model: Path | None = None
+    mesh: Path | None = None
+    mesh_up: str = "z"
+    database: Path | None = None
+    camera_id: int | None = None
+    scene: str = ""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        frame = self.frame_options()
+        is_rendered = self.model is None and self.photographs.images is None
+        of_renders = self.mapping.of_renders
+        of_model = [name for name in ("mesh", "database", "camera_id") if getattr(self, name) is not None]
+        reject(
+            (
+                not is_rendered and bool(of_renders),
+                "these are for maps of renders, not of photographs or a model",
+                of_renders,
+            ),
+            (is_rendered and frame != FrameOptions(), "scale and up belong to --model or --images", vars(frame)),
+            (self.model is None and bool(of_model), "these belong to --model", of_model),
+        )
+        if self.model is not None:
+            _ = self.import_config
+        elif not is_rendered:
+            _ = self.photographs_config
+
+    @property
+    def photographs_config(self) -> PhotographsConfig:
+        """How photographs are mapped."""
+        return replace(self.photographs, frame=self.frame_options(), **self._kept)
+
+    @property
+    def import_config(self) -> ImportConfig:
+        """How the model is imported."""
+        assert self.model is not None
+        given = self.photographs
+        return ImportConfig(
+            given.images,
+            given.max_side_px,
+            given.scale,
+            self.frame_options(),
+            **self._kept,
+            model=self.model,
+            database=self.database,
+        )
+
+    @property
+    def _kept(self) -> dict[str, Any]:
+        return {"extractor": self.mapping.extractor, "keep_database": self.mapping.keep_database}
 
     @changes_dataset("map")
     def run(self, log: Log = print, progress: Progress = ignore_progress) -> Dataset:
         """Write a COLMAP model of every scene with attributes of its landmarks, `<scene>/map/`.
 
-        Images are rendered along a walk. `mapping.photographs.images` makes one scene of photographs, without a mesh;
-        `mapping.existing.model` one of that model, with or without a mesh. Raises SceneError or MapError if a mesh or a
+        Images are rendered along a walk. `photographs.images` makes one scene of photographs, without a mesh; `model`
+        one of that model, with or without a mesh. Raises SceneError or MapError if a mesh or a
         model cannot be read, or no landmark could be triangulated.
         """
-        if self.mapping.existing.model is None and self.mapping.photographs.images is None:
+        if self.model is None and self.photographs.images is None:
             dataset = load_dataset(self, "scenes")
             for files in dataset.scenes:
                 _map_mesh(self, files, log)
                 progress(1)
             return dataset
         refuse_release(self.root)
-        if self.mapping.existing.model is not None:
+        if self.model is not None:
             scene, dataset = _import_model(self, log)
         else:
             scene = _map_photographs(self, log)
@@ -98,21 +158,13 @@ class Map(SceneOptions, LabelOptions):
 def _map_mesh(options: Map, files: SceneFolder, log: Log) -> None:
     """Map a scene by renders of its mesh, unless its map is current."""
     config = options.mapping
-    unused = (
-        "photographs",
-        "existing",
-        "frame",
-        "camera",
-        "draw_camera",
-    )  # the mapping camera is a part of the key itself
-    settings = {name: value for name, value in config.record().items() if name not in unused}
     scene = open_scene(options, files)
     seed = _seed(files)
     made_from = existing(files.mesh, SceneError, "scenes")
     floor = files.mapped_floor()
     camera = _mapping_camera(config, scene.camera, seed)
     views = [asdict(scene.config.free_space), camera.record(), seed, made_from, *([floor] if floor else [])]
-    cache = files.stage_cache("map", cache_key("map", [settings, *views]))
+    cache = files.stage_cache("map", cache_key("map", [config.record(), *views]))
     model = [files.map / name for name in ("cameras.bin", "images.bin", "points3D.bin")]
     if cache.is_current(files.landmarks, *model):
         log(f"{scene.name}: reusing {files.map}")
@@ -121,9 +173,19 @@ def _map_mesh(options: Map, files: SceneFolder, log: Log) -> None:
 
     with naming_file(files.mesh):
         space = PartOfFloor(scene.mesh_space, floor) if floor else scene.mesh_space
-        shown = (scene.mesh, scene.renderer, space, camera)
-        how = (scene.raycaster, options.n_workers, scene.device)
-        report = build_map(*shown, config, seed, files.map, *how, before_replace=cache.clear)
+        report = build_map(
+            scene.mesh,
+            scene.renderer,
+            space,
+            camera,
+            config,
+            seed,
+            files.map,
+            scene.raycaster,
+            options.n_workers,
+            scene.device,
+            before_replace=cache.clear,
+        )
     cache.store()
     landmarks = f"{report.n_landmarks:,} landmarks from {report.n_registered} images"
     distance = f"median {report.median_distance_to_mesh_cm:.2f} cm from the mesh"
@@ -147,32 +209,39 @@ def _seed(scene: SceneFolder) -> int:
 
 
 def _map_photographs(options: Map, log: Log) -> SceneFolder:
-    """Map the photographs in `mapping.photographs.images`: `<scene>/map/`, with finished steps in `<scene>/photographs/`.
+    """Map the photographs in `photographs.images`: `<scene>/map/`, with finished steps in `<scene>/photographs/`.
 
     Returns the scene, with the camera of most photographs unless one is configured. Raises what `map_photographs` does.
     """
     from wheretolook.mapping.photographs import list_photographs
 
-    settings = options.mapping.photographs
+    settings = options.photographs_config
     folder = settings.images
     assert folder is not None
-    scene = _new_scene(options, folder, settings.name or place_name(folder))
+    scene = _new_scene(options, folder)
     _with_scene(scene, options.root)
-    tables = [path for path in (settings.scale.marker_table, options.mapping.frame.positions) if path is not None]
+    tables = [path for path in (settings.scale.marker_table, settings.frame.positions) if path is not None]
     for path in tables:
         if not path.is_file():
             raise ConfigError("there is no such table", path=path)
     images = size_and_time([folder / name for name in list_photographs(folder)])
-    used = [settings.record(), options.mapping.extractor.record(), asdict(options.mapping.frame)]
+    used = [{**settings.record(), "name": options.scene}, settings.extractor.record(), asdict(settings.frame)]
     made_from = [images, [fingerprint(path) for path in tables]]
-    cache = scene.stage_cache("map", cache_key("map", [*used, options.mapping.keep_database, _seed(scene), *made_from]))
+    cache = scene.stage_cache("map", cache_key("map", [*used, settings.keep_database, _seed(scene), *made_from]))
     if cache.is_current(scene.landmarks, scene.mapping_cameras):
         log(f"{scene.name}: reusing {scene.map}")
         return _with_mapping_camera(options, scene)
     from wheretolook.mapping.photograph_map import map_photographs
 
-    how = (scene.folder / "photographs", _seed(scene), options.n_workers, options.warp_device)
-    report = map_photographs(options.mapping, scene.map, *how, before_replace=cache.clear)
+    report = map_photographs(
+        settings,
+        scene.map,
+        scene.folder / "photographs",
+        _seed(scene),
+        options.n_workers,
+        options.warp_device,
+        before_replace=cache.clear,
+    )
     cache.store()
     used_images = f"{report.n_registered} of {report.n_images} photographs"
     log(f"{scene.name}: {report.n_landmarks:,} landmarks from {used_images} -> {scene.map}")
@@ -182,32 +251,29 @@ def _map_photographs(options: Map, log: Log) -> SceneFolder:
 
 
 def _import_model(options: Map, log: Log) -> tuple[SceneFolder, Dataset]:
-    """Make a scene of the model in `mapping.existing.model`: `<scene>/map/`, and `<scene>/mesh.glb` if a mesh is given.
+    """Make a scene of the model in `options.model`: `<scene>/map/`, and `<scene>/mesh.glb` if a mesh is given.
 
     Returns the scene, and the dataset with it. Raises what `map_existing` does, and SceneError if the mesh cannot be used.
     """
     from wheretolook.mapping.colmap_model import read_model
-    from wheretolook.mapping.mapped_images import choose_features
+    from wheretolook.mapping.map import choose_features
 
-    settings = options.mapping.existing
-    photographs = options.mapping.photographs
+    settings = options.import_config
     folder = settings.model
-    assert folder is not None
-    scene = _new_scene(options, folder, settings.name or place_name(folder))
+    scene = _new_scene(options, folder)
     model = read_model(folder)
-    if photographs.images is None:
+    if settings.images is None:
         settings = replace(settings, database=choose_features(folder, model, settings.database))
-        options = replace(options, mapping=replace(options.mapping, existing=settings))
     if options.camera == CameraConfig():
-        scene = _with_own_camera(scene, model, settings)
+        scene = _with_own_camera(scene, model, folder, options.camera_id)
     dataset = _with_scene(scene, options.root)
-    tables = [photographs.scale.marker_table, options.mapping.frame.positions, settings.database]
+    tables = [settings.scale.marker_table, settings.frame.positions, settings.database]
     files = [*sorted(folder.iterdir()), *filter(None, tables)]
-    if photographs.images is not None:
+    if settings.images is not None:
         names = [image.name for _, image in sorted(model.images.items())]
-        files += [path_within(photographs.images, name, "the name of a model's image") for name in names]
-    mesh = [] if settings.mesh is None else [mesh_fingerprint(settings.mesh)]
-    chosen = {name: value for name, value in options.mapping.record().items() if name not in ("camera", "draw_camera")}
+        files += [path_within(settings.images, name, "the name of a model's image") for name in names]
+    mesh = [] if options.mesh is None else [mesh_fingerprint(options.mesh), options.mesh_up]
+    chosen = [settings.report(), settings.extractor.record()]
     made_from = size_and_time(filter(Path.is_file, files))
     cache = scene.stage_cache("map", cache_key("map", [chosen, _seed(scene), made_from, mesh]))
     if cache.is_current(scene.landmarks, scene.mapping_cameras, *([scene.mesh] if mesh else [])):
@@ -218,14 +284,21 @@ def _import_model(options: Map, log: Log) -> tuple[SceneFolder, Dataset]:
     from wheretolook.rendering.raycasting import MeshRaycaster
     from wheretolook.scenes.loading import load_mesh, save_glb
 
-    loaded = None if settings.mesh is None else load_mesh(settings.mesh, settings.mesh_up, colored=False)
+    loaded = None if options.mesh is None else load_mesh(options.mesh, options.mesh_up, colored=False)
     cache.clear()
-    how = (scene.folder / "photographs", _seed(scene), options.n_workers, options.warp_device)
-    report = map_existing(options.mapping, scene.map, *how, reconstruction=model)
+    report = map_existing(
+        settings,
+        scene.map,
+        scene.folder / "photographs",
+        _seed(scene),
+        options.n_workers,
+        options.warp_device,
+        reconstruction=model,
+    )
     scene.mesh.unlink(missing_ok=True)
-    if settings.mesh is not None and loaded is not None:
+    if options.mesh is not None and loaded is not None:
         loaded = loaded.transformed(read_frame(scene.map).world_from_map)
-        warn_of_mesh(settings.mesh, scene.read_landmarks().points, MeshRaycaster(loaded, options.warp_device))
+        warn_of_mesh(options.mesh, scene.read_landmarks().points, MeshRaycaster(loaded, options.warp_device))
         save_glb(loaded, scene.mesh)
     cache.store()
     removed = f", {report.n_landmarks_removed:,} points removed" if report.n_landmarks_removed else ""
@@ -234,12 +307,13 @@ def _import_model(options: Map, log: Log) -> tuple[SceneFolder, Dataset]:
     return scene, dataset
 
 
-def _new_scene(options: Map, source: Path, name: str) -> SceneFolder:
+def _new_scene(options: Map, source: Path) -> SceneFolder:
     """Return the scene of a folder of photographs or a model.
 
     Raises ConfigError if the name cannot be a folder's, or the scene's map would be replaced by one of another source.
     """
-    check_folder_name("a scene's name, mapping.photographs.name or mapping.existing.name,", name, NOT_SCENES)
+    name = options.scene or place_name(source)
+    check_folder_name("a scene's name, --scene,", name, NOT_SCENES)
     scene = SceneFolder(options.root / name, "test", options.camera.camera)
     if source.resolve().is_relative_to(scene.folder.resolve()):
         fix = f"Name the scene instead of its map: --name {options.name} --scene {name}."
@@ -253,23 +327,25 @@ def _new_scene(options: Map, source: Path, name: str) -> SceneFolder:
 
 def _with_mapping_camera(options: Map, scene: SceneFolder) -> SceneFolder:
     """Return the scene with the camera that took most of its photographs, unless the options configure one."""
-    from wheretolook.mapping.colmap_model import camera_of_model, read_model
+    from wheretolook.geometry.camera import cameras_by_id
+    from wheretolook.mapping.colmap_model import read_model
 
     if options.camera != CameraConfig():
         return scene
     model = read_model(scene.map)
     taken = Counter(image.camera_id for image in model.images.values() if image.has_pose)
     ((number, _),) = taken.most_common(1)
-    return replace(scene, camera=camera_of_model(model, scene.map, number), own_camera=True)
+    return replace(scene, camera=cameras_by_id(model.cameras, scene.map)[number], own_camera=True)
 
 
-def _with_own_camera(scene: SceneFolder, model: Any, settings: ExistingModelConfig) -> SceneFolder:
-    """Return the scene with the model's camera."""
-    from wheretolook.mapping.colmap_model import camera_of_model
+def _with_own_camera(scene: SceneFolder, model: Any, folder: Path, camera_id: int | None) -> SceneFolder:
+    """Return the scene with a camera of the model in a folder."""
+    from wheretolook.geometry.camera import cameras_by_id
+    from wheretolook.mapping.colmap_model import find_camera
 
-    assert settings.model is not None
     try:
-        return replace(scene, camera=camera_of_model(model, settings.model, settings.camera_id), own_camera=True)
+        camera = find_camera(cameras_by_id(model.cameras, folder), folder, camera_id)
+        return replace(scene, camera=camera, own_camera=True)
     except MapError as error:
         fix = "Name one of the model's, such as --camera-id 1, or describe another, such as --camera.fov_deg 70."
         raise MapError(error.problem, path=error.path, value=error.value, fix=fix) from error
@@ -335,10 +411,8 @@ def imports_map(run: Callable[..., Any]) -> Callable[..., Any]:
     @wraps(run)
     def run_on_scene(command: Any, log: Log = print, progress: Progress = ignore_progress) -> Any:
         if command.map is not None:
-            files = {"database": command.database, "mesh": command.mesh}
-            existing = ExistingModelConfig(command.map, **files, camera_id=command.camera_id)
-            mapping = MapConfig(frame=command.frame_options(), extractor=command.mapping.extractor, existing=existing)
-            replace(select_options(Map, command), mapping=mapping).run(log)
+            mapping = MapConfig(extractor=command.mapping.extractor)
+            select_options(Map, command, mapping=mapping, model=command.map).run(log)
         return run(command, log, progress)
 
     return run_on_scene

@@ -34,8 +34,8 @@ from wheretolook.utils.texts import LOG
 from wheretolook.visibility.config import OcclusionConfig
 
 if TYPE_CHECKING:
-    from wheretolook.dataset.environment import SceneEnvironment
     from wheretolook.dataset.layout import Dataset, SceneFolder
+    from wheretolook.dataset.scene import Scene
     from wheretolook.localization.shard import SceneJob
 
 
@@ -292,10 +292,10 @@ class Experiment(SceneOptions, LabelOptions):
     tracking: TrackingConfig = field(default_factory=TrackingConfig)
 
 
-def select_options(command: type[T], options: object) -> T:
-    """Return a command with those of its options that another command's options include."""
+def select_options(command: type[T], options: object, **given: Any) -> T:
+    """Return a command with the given options, and those of its others that another command's options include."""
     names = [field.name for field in fields(command) if hasattr(options, field.name)]  # type: ignore[arg-type]
-    return command(**{name: getattr(options, name) for name in names})
+    return command(**{**{name: getattr(options, name) for name in names}, **given})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -379,13 +379,13 @@ def load_dataset(
     return dataset
 
 
-def open_scene(options: SceneOptions, files: SceneFolder) -> SceneEnvironment:
+def open_scene(options: SceneOptions, files: SceneFolder) -> Scene:
     """Return a scene of the dataset with a command's occlusion, free space and device; nothing is read yet."""
-    from wheretolook.dataset.environment import EnvironmentConfig, SceneEnvironment
+    from wheretolook.dataset.scene import Scene, SceneConfig
 
     scenes = options.scenes
-    config = EnvironmentConfig(options.occlusion, scenes.free_space, scenes.mapped_space)
-    scene = SceneEnvironment(files, config=config, device=options.device)
+    config = SceneConfig(options.occlusion, scenes.free_space, scenes.mapped_space)
+    scene = Scene(files, config=config, device=options.device)
     if files.own_camera:
         camera = f"the camera of its map, {describe_camera(files.camera)}"
         LOG.info("%s: %s", files.name, "; ".join((camera, *scene.frame.doubts)))

@@ -37,7 +37,7 @@ class Plan(SceneOrMapOptions):
 
     Examples:
       wheretolook plan --config configs/demo.yaml --scene apartment-000 --start -4,-3,1.4 --goal 4,3,1.4 \\
-        --plan.against '[forward]' --film mp4 --out way
+        --against forward --film mp4 --out way
       wheretolook plan --map sparse/0 --start 1,1,1.4 --goal 5,4,1.4 --out way
 
     Args:
@@ -45,11 +45,8 @@ class Plan(SceneOrMapOptions):
         tracking: where MLflow keeps its runs.
     """
 
-    SHORT: ClassVar = {
-        **{name: f"plan.{name}" for name in ("scene", "start", "goal", "method", "weights", "accuracy", "out", "film")},
-        "stops": "plan.stops.looks",
-    }
-
+    SHORT: ClassVar = {"stops": "stops.looks"}
+    GROUPS: ClassVar = {"plan": ""}
     WRITES: ClassVar = "path.csv"
 
     plan: PlanConfig = field(default_factory=PlanConfig)

@@ -10,9 +10,9 @@ import numpy as np
 from wheretolook.commands.map import SceneOrMapOptions, imports_map
 from wheretolook.commands.options import Log, Progress, existing, ignore_progress, load_dataset, naming_file, open_scene
 from wheretolook.dataset.dataset_lock import changes_dataset
-from wheretolook.dataset.environment import SceneEnvironment
 from wheretolook.dataset.layout import Dataset
 from wheretolook.dataset.sampling_config import SampleConfig
+from wheretolook.dataset.scene import Scene
 from wheretolook.geometry.camera import Camera, draw_camera, write_cameras
 from wheretolook.utils.errors import MapError, SceneError
 from wheretolook.utils.files import cache_key
@@ -55,8 +55,8 @@ class Sample(SceneOrMapOptions):
         return dataset
 
 
-def _key(scene: SceneEnvironment, config: SampleConfig) -> str:
-    files = scene.files
+def _key(scene: Scene, config: SampleConfig) -> str:
+    files = scene.folder
     space = asdict(scene.config.free_space)
     stage = "scenes"
     if scene.is_photographed:
@@ -67,12 +67,12 @@ def _key(scene: SceneEnvironment, config: SampleConfig) -> str:
         if not chosen[name]:  # keys of datasets that were sampled before this option existed
             del chosen[name]
     chosen["max_directions"] = config.directions_of(files.split)
-    made_from = [existing(scene.source, SceneError, stage), existing(files.landmarks, MapError, "map")]
+    made_from = [existing(files.source, SceneError, stage), existing(files.landmarks, MapError, "map")]
     settings = [chosen, scene.occlusion_config.settings(), space, scene.camera.record()]
     return cache_key("sample", [*settings, *made_from])
 
 
-def _cameras(scene: SceneEnvironment, config: SampleConfig) -> Camera | dict[int, Camera]:
+def _cameras(scene: Scene, config: SampleConfig) -> Camera | dict[int, Camera]:
     """Return the scene's camera, or those drawn for it by number; other scenes do not change the draw."""
     if not config.cameras:
         return scene.camera
@@ -80,13 +80,13 @@ def _cameras(scene: SceneEnvironment, config: SampleConfig) -> Camera | dict[int
     return {number: draw_camera(rng) for number in range(1, config.cameras + 1)}
 
 
-def _sample(scene: SceneEnvironment, config: SampleConfig, log: Log) -> None:
+def _sample(scene: Scene, config: SampleConfig, log: Log) -> None:
     from wheretolook.dataset.sampling import sample_viewpoints
     from wheretolook.dataset.viewpoint_files import write_table
     from wheretolook.mapping.colmap_model import colmap_poses
 
-    files = scene.files
-    with naming_file(scene.source):
+    files = scene.folder
+    with naming_file(files.source):
         grid, free = scene.free_voxels(config, scene.sampled_space)
         cameras = _cameras(scene, config)
         visible = (scene.landmarks, cameras, scene.occlusion)

@@ -35,8 +35,7 @@ class BuildViewpointMap(SceneOrMapOptions):
         viewpoint_map: which views, and how they are scored.
     """
 
-    SHORT: ClassVar = {name: f"viewpoint_map.{name}" for name in ("scene", "method", "weights", "accuracy", "out")}
-
+    GROUPS: ClassVar = {"viewpoint_map": ""}
     WRITES: ClassVar = "viewpoint_map.json"
 
     viewpoint_map: ViewpointMapConfig = field(default_factory=ViewpointMapConfig)
@@ -67,7 +66,7 @@ class BuildViewpointMap(SceneOrMapOptions):
         built: dict[str, ViewpointMap] = {}
         for files in scenes:
             scene = open_scene(self, files)
-            with naming_file(scene.source):
+            with naming_file(scene.folder.source):
                 scorer = scene_scorer(scene, config.method, config.weights, config.anywhere, config.accuracy)
                 viewpoint_map = scene_viewpoint_map(scene, config, scorer)
             folder = config.out or files.folder / "viewpoint-map"

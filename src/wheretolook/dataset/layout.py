@@ -16,6 +16,9 @@ from wheretolook.geometry.camera import Camera, PinholeCamera, camera_of_record,
 from wheretolook.geometry.poses import Float
 from wheretolook.mapping.colmap_model import CAMERAS_FILE, load_mapping_poses
 from wheretolook.mapping.georeference import read_scale
+from wheretolook.mapping.landmarks import Landmarks, read_feature_name
+from wheretolook.mapping.map import Map
+from wheretolook.mapping.map_frame import read_frame
 from wheretolook.utils.errors import ConfigError, TableError, check_choice
 from wheretolook.utils.files import ArtifactCache, fingerprint, read_json_object, safe_child, write_json
 
@@ -23,7 +26,6 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from wheretolook.inputs.localization_map import LocalizationMap
-    from wheretolook.mapping.landmarks import Landmarks
 
 STAGES = ("scenes", "map", "sample", "label")
 """Stages that work scene by scene, in order; the names in `stages.json`."""
@@ -107,6 +109,11 @@ class SceneFolder:
         """
         return not self.mesh.is_file() and read_scale(self.map) is not None
 
+    @property
+    def source(self) -> Path:
+        """The file that everything follows from: the mesh, or else the poses of the photographs."""
+        return self.mapping_cameras if self.is_photographed else self.mesh
+
     def stage_cache(self, stage: str, key: str = "") -> ArtifactCache:
         """The key that a stage of `STAGES` was finished with, in `stages.json`."""
         return ArtifactCache(self.folder, key, stage, "stages.json", STAGES)
@@ -145,14 +152,21 @@ class SceneFolder:
 
     def read_landmarks(self) -> Landmarks:
         """The map's landmarks. Raises MapError if there is no file of them, or it is damaged."""
-        from wheretolook.mapping.landmarks import Landmarks
-
         landmarks = Landmarks.load(self.landmarks)
         if landmarks.mapping_focal_px is not None:
             return landmarks
         # in the release, viewpoints have the camera of the mapping images
         focal_px = np.full(len(landmarks), self.camera.mean_focal_px, dtype=np.float32)
         return replace(landmarks, mapping_focal_px=focal_px)
+
+    def open_map(self, device: str = "cpu") -> Map:
+        """Open the map with its frame, without the observations of its photographs (`Map.with_images`); reads no model.
+
+        Raises MapError if it is missing, damaged, or in any unit.
+        """
+        has_photographs = read_scale(self.map) is not None
+        frame = read_frame(self.map)
+        return Map(self.read_landmarks(), self.mapping_poses(), frame, has_photographs, self.map)
 
     def localization_map(self, camera: Camera | None = None, device: str = "cpu") -> LocalizationMap:
         """The scene's map with the occlusion stored for its sampled locations; the mesh is not needed.
@@ -164,7 +178,7 @@ class SceneFolder:
 
         landmarks = self.read_landmarks()
         occlusion = StoredOcclusion.load(self.occlusion)
-        return LocalizationMap(landmarks, camera or self.camera, occlusion, device, self.mapping_poses())
+        return LocalizationMap(Map(landmarks, self.mapping_poses()), camera or self.camera, occlusion, device)
 
 
 def views_by_camera(
@@ -212,8 +226,6 @@ class Dataset:
     @property
     def features(self) -> str:
         """Name of the features of all its maps; "" if they differ, or there is no map. Raises MapError if damaged."""
-        from wheretolook.mapping.landmarks import read_feature_name
-
         names = {read_feature_name(scene.landmarks) for scene in self.scenes if scene.landmarks.is_file()}
         return names.pop() if len(names) == 1 else ""
 

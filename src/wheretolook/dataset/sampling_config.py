@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal, get_args
 
-from wheretolook.geometry.lattices import ViewLattice
-from wheretolook.utils.errors import ConfigError, check_range
+from wheretolook.geometry.lattices import Lattice, ViewLattice
+from wheretolook.utils.errors import ConfigError, check_range, no_option
 
 Split = Literal["train", "val", "test"]  # scenes for training, validation and testing
 
@@ -33,8 +33,9 @@ class SampleConfig(ViewLattice):
         memory_gb: bound on the memory that counting takes on its device, in 10^9 bytes; two million landmarks fit.
     """
 
+    lattice: Lattice = no_option("fibonacci")
     keep: int = 100
-    min_visible: int = 1
+    min_visible: int = no_option(1)
     max_locations: int = 0
     max_directions: int | dict[Split, int] = 0
     seed: int = 0

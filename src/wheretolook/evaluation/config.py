@@ -11,7 +11,7 @@ import numpy as np
 
 from wheretolook.dataset.config import THRESHOLDS
 from wheretolook.scorers.registry import methods_named, scorers
-from wheretolook.utils.errors import ConfigError, check_choice, check_positive, check_range
+from wheretolook.utils.errors import ConfigError, check_choice, check_positive, check_range, no_option
 from wheretolook.utils.package import or_shipped
 from wheretolook.visibility.config import check_occlusion_names
 
@@ -54,17 +54,17 @@ class EvaluateConfig:
     methods: tuple[str, ...] = field(default_factory=_all_methods)
     weights: tuple[Path, ...] = ()
     split: Literal["train", "val", "test"] = "test"
-    top_n: tuple[int, ...] = (1, 5, 10)
-    thresholds: tuple[tuple[float, float], ...] = THRESHOLDS
-    seed: int = 0
-    resamples: int = 2000
+    top_n: tuple[int, ...] = no_option((1, 5, 10))
+    thresholds: tuple[tuple[float, float], ...] = no_option(THRESHOLDS)
+    seed: int = no_option(0)
+    resamples: int = no_option(2000)
     occlusions: tuple[str, ...] = ()
     candidates: tuple[int, ...] = (0,)
-    block_m: float = 1.0
-    heading: tuple[tuple[float, float, float], ...] = ()
+    block_m: float = no_option(1.0)
+    heading: tuple[tuple[float, float, float], ...] = no_option(())
     photographs: bool = False
     anywhere: bool = False
-    reference: str = ""
+    reference: str = no_option("")
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "weights", tuple(map(or_shipped, self.weights)))

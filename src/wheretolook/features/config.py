@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from wheretolook.features.extractor import Extraction, Keypoints
 from wheretolook.features.opencv_sift import EDGE_THRESHOLD, MAX_KEYPOINTS, PEAK_THRESHOLD
 from wheretolook.features.registry import all_extractors, runnable_extractors
-from wheretolook.utils.errors import ConfigError, check_choice, check_positive, check_range
+from wheretolook.utils.errors import ConfigError, check_choice, check_positive, check_range, no_option
 from wheretolook.utils.files import sha256
 from wheretolook.utils.processes import WorkerPool
 
@@ -42,9 +42,9 @@ class ExtractorConfig:
     """
 
     method: str = "opencv"
-    first_octave: int = -1
+    first_octave: int = no_option(-1)
     max_keypoints: int = MAX_KEYPOINTS
-    peak_threshold: float = PEAK_THRESHOLD
+    peak_threshold: float = no_option(PEAK_THRESHOLD)
     weights: str = ""
     edge_threshold: float = field(default=EDGE_THRESHOLD, init=False)
 

@@ -72,14 +72,14 @@ def choose_blocks(source: PhotographedMap, views: int = VIEWS) -> list[Block]:
 
     Raises MapError if fewer than two blocks leave a map.
     """
-    observes = observation_matrix(source.arrays, source.frame)
+    observes = observation_matrix(source.arrays, source.rig_frame)
     shared = np.asarray((observes @ observes.T).toarray(), dtype=np.float64)
     counts = np.maximum(np.diag(shared).copy(), 1)
     np.fill_diagonal(shared, 0)
     share = shared / counts[:, None]  # of a frame's landmarks, those that it shares with each other frame
     centers = camera_centers(source.poses)
-    sums = np.stack([np.bincount(source.frame, weights=axis) for axis in centers.T], axis=1).astype(np.float64)
-    places = sums / np.bincount(source.frame)[:, None]
+    sums = np.stack([np.bincount(source.rig_frame, weights=axis) for axis in centers.T], axis=1).astype(np.float64)
+    places = sums / np.bincount(source.rig_frame)[:, None]
     parts = _partition(share, places)
     walk = np.concatenate(parts)  # all frames, neighbours next to one another
     groups = [(part, True) for part in parts]
@@ -89,7 +89,7 @@ def choose_blocks(source: PhotographedMap, views: int = VIEWS) -> list[Block]:
         groups.append((order[: _block_size(observes, order, kept)], False))
     chosen = list[tuple[NDArray[np.int64], bool]]()
     for group, is_part in reversed(groups):  # of two that are the same, the one that is grown further is chosen
-        held_out = np.flatnonzero(np.isin(source.frame, group))
+        held_out = np.flatnonzero(np.isin(source.rig_frame, group))
         leaves_map = _landmarks_without(observes, group) >= MIN_LANDMARKS
         if leaves_map and not any(_same(held_out, other) for other, _ in chosen):
             chosen.append((held_out, is_part))

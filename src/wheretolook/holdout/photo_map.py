@@ -19,13 +19,20 @@ from wheretolook.geometry.camera import Camera, PinholeCamera, cameras_by_id, fi
 from wheretolook.geometry.poses import Float, camera_centers
 from wheretolook.geometry.similarity import Similarity
 from wheretolook.localization.config import versions
-from wheretolook.mapping.colmap_model import ModelArrays, colmap_poses, model_arrays, read_model, registered_names
-from wheretolook.mapping.config import ExistingModelConfig, FrameOptions, MapConfig, PhotographsConfig, place_name
+from wheretolook.mapping.colmap_model import (
+    ModelArrays,
+    compact_poses,
+    model_arrays,
+    read_model,
+    registered_names,
+    select_points,
+)
+from wheretolook.mapping.config import FrameOptions, ImportConfig, place_name
 from wheretolook.mapping.feature_files import DATABASE_FILE, read_descriptors
 from wheretolook.mapping.georeference import DEPTH_M, median_depths
 from wheretolook.mapping.landmarks import load_colmap_landmarks
+from wheretolook.mapping.map import Map, find_features, find_photographs
 from wheretolook.mapping.map_frame import IDENTITY, MapFrame, find_frame, has_photographs
-from wheretolook.mapping.mapped_images import MappedImages, find_features, find_photographs
 from wheretolook.utils.errors import ConfigError, MapError, MapWarning
 from wheretolook.utils.files import ArtifactCache, cache_key, fingerprint, safe_child, size_and_time
 from wheretolook.utils.texts import LOG
@@ -84,10 +91,9 @@ class PhotographedMap:
         model: `pycolmap.Reconstruction`, turned and scaled.
         arrays: the same as arrays.
         features: COLMAP database or hloc's HDF5 file with keypoints and descriptors of the photographs.
-        own_frame: the model's own frame.
-        frame: (I,) number, from 0, of the rig frame that each photograph belongs to.
+        frame: the model's own frame.
+        rig_frame: (I,) number, from 0, of the rig frame that each photograph belongs to.
         cameras: of each photograph.
-        poses: (I, 3, 4) cam_from_world.
         own_centers: (I, 3) camera centres in the model's own frame and unit.
         depth_m: (I,) median depth of the landmarks that each observes, NaN where it observes none.
         key: changes with the model and the features.
@@ -100,10 +106,9 @@ class PhotographedMap:
     model: Any
     arrays: ModelArrays
     features: Path
-    own_frame: MapFrame
-    frame: NDArray[np.int64]
+    frame: MapFrame
+    rig_frame: NDArray[np.int64]
     cameras: tuple[Camera, ...]
-    poses: Float
     own_centers: Float
     depth_m: Float
     key: str
@@ -129,23 +134,33 @@ class PhotographedMap:
         return crop_pixels(self.cameras[row], pixels, self.fov_deg, crop)
 
     @cached_property
-    def images(self) -> MappedImages:
-        """The photographs with what they observe of the whole map."""
-        of_map = self.path, self.features, None, "cpu", self.model
+    def map(self) -> Map:
+        """The whole map, which scorers use."""
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", MapWarning)
-            landmarks = load_colmap_landmarks(*of_map, arrays=self.arrays)
-        return MappedImages.of(landmarks, self.arrays, self.poses, self.cameras)
+            landmarks = load_colmap_landmarks(self.path, self.features, reconstruction=self.model, arrays=self.arrays)
+        return Map(
+            landmarks,
+            compact_poses(self.poses),
+            has_photographs=self.photographs,
+            cameras=dict(zip(self.arrays.image_cameras.tolist(), self.cameras, strict=True)),
+            images=select_points(self.arrays, np.isin(self.arrays.point_ids, landmarks.ids)),
+        )
+
+    @property
+    def poses(self) -> Float:
+        """Poses (I, 3, 4) cam_from_world."""
+        return self.arrays.image_poses
 
     @property
     def is_metric(self) -> bool:
         """Whether the scale is known."""
-        return self.own_frame.scale.is_metric
+        return self.frame.scale.is_metric
 
     @property
     def from_model(self) -> Similarity:
         """Transform from the model's own frame."""
-        return self.own_frame.world_from_map
+        return self.frame.world_from_map
 
     @property
     def names(self) -> list[str]:
@@ -197,20 +212,18 @@ def open_map(
     if model.num_points3D() == 0:
         fix = "Triangulate it, or give the folder of its photographs: --images."
         raise MapError("the model has no points", path=model_dir, fix=fix)
-    poses = colmap_poses(model_dir, model)
-    own_centers = camera_centers(poses)
     arrays = model_arrays(model)
-    observed = float(np.median(np.bincount(arrays.observation_image, minlength=len(poses))))
+    own_centers = camera_centers(arrays.image_poses)
+    observed = float(np.median(np.bincount(arrays.observation_image, minlength=len(own_centers))))
     if observed < MIN_OBSERVED:
         problem = f"half of the photographs observe fewer than {MIN_OBSERVED} landmarks"
         fix = "Give a model with tracks, and the photographs it was made from."
         raise MapError(problem, path=model_dir, value=observed, fix=fix)
     original = model if source in (None, model_dir) else read_model(source)
-    own_frame = find_frame(source or model_dir, original if original.num_points3D() else model, frame)
-    to_frame = own_frame.world_from_map
+    found = find_frame(source or model_dir, original if original.num_points3D() else model, frame)
+    to_frame = found.world_from_map
     if to_frame.record() != IDENTITY.world_from_map.record():
         to_frame.transform_model(model)
-        poses = colmap_poses(model_dir, model)
         arrays = model_arrays(model)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", MapWarning)  # the error below replaces it
@@ -225,13 +238,12 @@ def open_map(
         model=model,
         arrays=arrays,
         features=features,
-        own_frame=own_frame,
-        frame=np.unique([image.frame_id for image in images], return_inverse=True)[1].reshape(-1).astype(np.int64),
+        frame=found,
+        rig_frame=np.unique([image.frame_id for image in images], return_inverse=True)[1].reshape(-1).astype(np.int64),
         cameras=tuple(cameras[image.camera_id] for image in images),
-        poses=poses,
         own_centers=own_centers,
-        depth_m=median_depths(arrays, poses),
-        key=cache_key(_fingerprints(model_dir), size_and_time([features.resolve()]), own_frame.record()),
+        depth_m=median_depths(arrays, arrays.image_poses),
+        key=cache_key(_fingerprints(model_dir), size_and_time([features.resolve()]), found.record()),
         photographs=has_photographs(source or model_dir),
     )
 
@@ -287,10 +299,8 @@ def features_of(
         return out, out / DATABASE_FILE
     _check_photographs(model, model_dir)
     shutil.rmtree(out, ignore_errors=True)
-    existing = ExistingModelConfig(model=model_dir)
     own = FrameOptions(scale=1, up="z")
-    photographs = PhotographsConfig(images=images)
-    config = MapConfig(frame=own, existing=existing, photographs=photographs, extractor=extractor, keep_database=True)
+    config = ImportConfig(images, model=model_dir, frame=own, extractor=extractor, keep_database=True)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", MapWarning)  # about the frame, which `open_map` corrects
         map_existing(config, out, work / "photographs", workers=workers, device=device, reconstruction=model)

@@ -76,7 +76,7 @@ def weak_parts(source: PhotographedMap, results: list[HoldoutResult], views: pd.
     good = tested["good"].to_numpy(dtype=bool)
     if good.all():
         return []
-    observes = observation_matrix(source.arrays, source.frame)[source.frame[rows]]
+    observes = observation_matrix(source.arrays, source.rig_frame)[source.rig_frame[rows]]
     shared = np.asarray((observes @ observes.T).toarray())
     counts = np.maximum(np.diag(shared), 1)
     alike = shared >= MIN_SHARED * np.minimum(counts[:, None], counts)
@@ -230,7 +230,7 @@ class CheckReport:
         if source.is_turned:
             lines.append("the model was turned upright; --up states another direction, --up z keeps the model's")
         if not source.is_metric:
-            lines.extend(source.own_frame.doubts[:1])
+            lines.extend(source.frame.doubts[:1])
         if not self.parts:
             return [*lines, "no part of the map fails without its neighbours"]
         lines.append(f"photograph again ({len(self.parts)} parts relocalize badly, {source.unit}):")

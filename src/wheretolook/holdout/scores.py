@@ -21,7 +21,7 @@ from wheretolook.holdout.photo_map import PhotographedMap
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.colmap_model import compact_poses
 from wheretolook.mapping.landmarks import load_colmap_landmarks
-from wheretolook.mapping.map_frame import IDENTITY
+from wheretolook.mapping.map import Map
 from wheretolook.scorers.base import Scorer
 from wheretolook.scorers.registry import make_scorer
 from wheretolook.scorers.weights import load_scorer, resolve_weights
@@ -82,13 +82,13 @@ def check_place(source: PhotographedMap, scoring: Scoring, device: str) -> None:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", MapWarning)
             landmarks = load_colmap_landmarks(source.path, reconstruction=source.model, progress=False)
-        scoring.scorer(LocalizationMap(landmarks, source.cameras[0], device=device, photographs=source.photographs))
+        whole = Map(landmarks, has_photographs=source.photographs)
+        scoring.scorer(LocalizationMap(whole, source.cameras[0], device=device))
 
 
 def whole_map(source: PhotographedMap, occlusion: OcclusionModel, device: str) -> LocalizationMap:
     """Return the map with all photographs, for the camera of the first."""
-    of_images = compact_poses(source.poses), IDENTITY, source.photographs, source.images
-    return LocalizationMap(source.images.landmarks, source.cameras[0], occlusion, device, *of_images)
+    return LocalizationMap(source.map, source.cameras[0], occlusion, device)
 
 
 def score_views(
@@ -123,8 +123,9 @@ def maps_without(
     cached = occlusion if occlusion.name == "none" else CachedOcclusion(occlusion)
     cameras = [camera for camera, _ in _views(source, result.views)]
     poses = compact_poses(source.poses[remaining])
-    of_images = poses, IDENTITY, source.photographs, source.images if source.photographs else None
-    localization_map = LocalizationMap(result.landmarks, cameras[0], cached, device, *of_images)
+    whole = source.map if source.photographs else None
+    part = Map(result.landmarks, poses, has_photographs=source.photographs, whole=whole)
+    localization_map = LocalizationMap(part, cameras[0], cached, device)
     for camera in dict.fromkeys(cameras):
         rows = np.array([row for row, other in enumerate(cameras) if other == camera])
         yield rows, localization_map.of_camera(camera)

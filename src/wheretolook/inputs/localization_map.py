@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,8 +14,8 @@ from wheretolook.geometry.poses import Float, camera_centers, check_poses
 from wheretolook.inputs.bins import BinnedViews, bin_views, count_bins
 from wheretolook.mapping.config import FrameOptions
 from wheretolook.mapping.landmarks import Landmarks
-from wheretolook.mapping.map_frame import IDENTITY, MapFrame, has_photographs, warn_of_mesh
-from wheretolook.mapping.mapped_images import MappedImages, open_colmap
+from wheretolook.mapping.map import Map
+from wheretolook.mapping.map_frame import MapFrame, warn_of_mesh
 from wheretolook.utils.errors import check_positive
 from wheretolook.visibility import frustum
 from wheretolook.visibility.frustum import LandmarkSets, PosedViews, in_view_by_table, landmarks_in_view
@@ -34,14 +33,10 @@ MIN_LINES_FOR_TABLE = 1_000_000
 class LocalizationMap:
     """A map to localize against, for everything that scores viewpoints."""
 
-    landmarks: Landmarks
+    map: Map  # in the world: metres, z up
     camera: Camera  # the one to localize: a pinhole, or any COLMAP model
     occlusion: OcclusionModel = NoOcclusion()  # which landmarks have a free line of sight from a location
     device: str = "cpu"  # where kernels run, "cpu" or a CUDA device
-    mapping_poses: Float | None = None  # cam_from_world (M, 3, 4) of the images the map was made from, if known
-    frame: MapFrame = IDENTITY  # the map's own frame; everything here is in the world: metres, z up
-    photographs: bool = False  # whether the mapping images are photographs, see `scorers.set.own_images.for_map`
-    images: MappedImages | None = None  # the mapping images with their observations, if known
 
     @classmethod
     def from_colmap(
@@ -55,11 +50,10 @@ class LocalizationMap:
         database: str | Path | None = None,
         **frame: Any,
     ) -> LocalizationMap:
-        """Open any COLMAP model (version 3 or 4, binary or text), of any unit and direction up.
+        """Open any COLMAP model, as `wheretolook.mapping.map.Map.open`, whose arguments, warnings and errors are these.
 
         Poses that scorers of it take are in the world, metres with z up: `frame.world_from_map` transforms them. A
-        `MapWarning` states which points are left out, what was assumed of an unknown unit or direction up, and that the
-        mesh seems to be in another frame.
+        `MapWarning` also states that the mesh seems to be in another frame.
 
         Args:
             model: folder of the model.
@@ -68,41 +62,49 @@ class LocalizationMap:
             mesh: a mesh of the scene in the model's frame, for true occlusion.
             occlusion: another model, such as `HiddenPointRemoval()` where there is nothing but the landmarks, or
                 `TsdfOcclusion` where there are depth images. With neither, landmarks are seen through walls.
-            max_reprojection_error_px: landmarks with a larger mean error are left out. None for all that the model's
-                own mapper kept.
+            max_reprojection_error_px: landmarks with a larger mean error are left out.
             device: where kernels run.
-            database: the COLMAP database the model was built from, or hloc's features in HDF5, for the landmarks'
-                ambiguity, which is unknown without; by default as `wheretolook.mapping.mapped_images.choose_features`.
+            database: features, for the landmarks' ambiguity.
             frame: scale, distance, positions or up, see `wheretolook.mapping.config.FrameOptions`.
 
         Raises:
-            MapError: no usable model in the folder, no such camera in it, or several and none is named; or the database
-                is unreadable or another's.
+            MapError: as `Map.open`; or no such camera in the model, or several and none is named.
             SceneError: the mesh cannot be used.
             ConfigError: the largest reprojection error is not positive.
         """
         if max_reprojection_error_px is not None:
             check_positive("max_reprojection_error_px", max_reprojection_error_px)
-        opened = (model, camera, database, max_reprojection_error_px, device, FrameOptions(**frame))
-        landmarks, camera, poses, own_frame, images = open_colmap(*opened)
+        opened = Map.open(model, database, FrameOptions(**frame), max_reprojection_error_px, device)
+        camera = opened.camera(camera)
         if mesh is not None:
             from wheretolook.scenes.loading import load_mesh
             from wheretolook.space.free_space import FreeSpace
             from wheretolook.visibility.occlusion import MeshOcclusion
 
-            space = FreeSpace(load_mesh(Path(mesh), colored=False).transformed(own_frame.world_from_map), device=device)
+            to_world = opened.frame.world_from_map
+            space = FreeSpace(load_mesh(Path(mesh), colored=False).transformed(to_world), device=device)
             occlusion = MeshOcclusion(space.raycaster, two_sided=space.two_sided)
-            warn_of_mesh(mesh, landmarks.points, space.raycaster)
-        of_images = poses, own_frame, has_photographs(Path(model)), images
-        return cls(landmarks, camera, occlusion or NoOcclusion(), device, *of_images)
+            warn_of_mesh(mesh, opened.landmarks.points, space.raycaster)
+        return cls(opened, camera, occlusion or NoOcclusion(), device)
+
+    @property
+    def landmarks(self) -> Landmarks:
+        """The map's landmarks."""
+        return self.map.landmarks
+
+    @property
+    def frame(self) -> MapFrame:
+        """The map's own frame; everything here is in the world."""
+        return self.map.frame
+
+    @property
+    def mapping_poses(self) -> Float | None:
+        """Poses cam_from_world (M, 3, 4) of the mapping images; None if unknown."""
+        return self.map.mapping_poses
 
     def of_camera(self, camera: Camera) -> LocalizationMap:
         """Return the same map for another camera."""
-        if camera == self.camera:
-            return self
-        other = replace(self, camera=camera)
-        vars(other)["_points_on_device"] = self._points_on_device
-        return other
+        return self if camera == self.camera else replace(self, camera=camera)
 
     def bin_views(self, cam_from_world: Float, bins: int = 30, landmark_channels: bool = False) -> BinnedViews:
         """Bin the visible landmarks of views (B, 3, 4) in bins x bins cells of the image.
@@ -137,9 +139,12 @@ class LocalizationMap:
             sets = landmarks_in_view(views)
         return sets.starts.astype(np.int64), torch.from_numpy(sets.indices).to(self.device)
 
-    @cached_property
+    @property
     def _points_on_device(self) -> Any:
-        return frustum.points_on_device(self.landmarks.points, self.device)
+        known = self.map.computed
+        if self.device not in known:
+            known[self.device] = frustum.points_on_device(self.landmarks.points, self.device)
+        return known[self.device]
 
     def _views(self, cam_from_world: Float) -> PosedViews:
         poses = check_poses(cam_from_world)

@@ -8,7 +8,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, Literal
 
-from wheretolook.utils.errors import ConfigError, check_choice, check_positive, check_range
+from wheretolook.utils.errors import ConfigError, check_choice, check_positive, check_range, no_option
 from wheretolook.utils.files import sha256
 from wheretolook.utils.package import VERSION
 
@@ -40,12 +40,12 @@ class LocalizerConfig:
     """
 
     method: Literal["first", "hypotheses"] = "first"
-    max_ratio: float = 0.85
+    max_ratio: float = no_option(0.85)
     min_similarity: float | None = None
     lightglue: str = ""
     min_matches: int = field(default=4, init=False)
-    max_error_px: float = 8.0
-    min_inliers: int = 10
+    max_error_px: float = no_option(8.0)
+    min_inliers: int = no_option(10)
     seed: int = 0
     confidence: float = field(default=0.9999, init=False)
     min_trials: int = field(default=100, init=False)

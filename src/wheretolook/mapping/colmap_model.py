@@ -9,7 +9,7 @@ import itertools
 import re
 import warnings
 from codecs import BOM_UTF8
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,7 +22,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
-from wheretolook.geometry.camera import MAX_SIDE_PX, Camera, cameras_by_id, mean_focal_px, only_camera
+from wheretolook.geometry.camera import MAX_SIDE_PX, Camera, mean_focal_px, only_camera
 from wheretolook.geometry.poses import Float, camera_centers
 from wheretolook.geometry.similarity import local_origin
 from wheretolook.utils.errors import MapError, MapWarning, StorageError
@@ -205,8 +205,10 @@ class ModelArrays:
     errors_px: NDArray[np.float64]  # (P,) mean reprojection error
     image_ids: NDArray[np.int64]  # (I,) ascending
     image_names: list[str]  # I names
+    image_poses: NDArray[np.float64]  # (I, 3, 4) cam_from_world
     image_centers: NDArray[np.float64]  # (I, 3) camera centres in the world
-    image_focal_px: NDArray[np.float64]  # (I,) mean focal length of the image's camera
+    image_cameras: NDArray[np.int64]  # (I,) camera_id of the image's camera
+    image_focal_px: NDArray[np.float64]  # (I,) its mean focal length
     observation_start: NDArray[np.int64]  # (P + 1,); observations start[i] to start[i + 1] belong to point i
     observation_image: NDArray[np.int64]  # (O,) row in `image_ids`
     observation_keypoint: NDArray[np.int64]  # (O,) index of the keypoint in its image
@@ -309,7 +311,9 @@ def model_arrays(reconstruction: Any) -> ModelArrays:
         errors_px=points["error"],
         image_ids=image_ids,
         image_names=[image.name for image in images],
+        image_poses=np.array([image.cam_from_world().matrix() for image in images]).reshape(-1, 3, 4),
         image_centers=np.array([image.projection_center() for image in images], dtype=np.float64).reshape(-1, 3),
+        image_cameras=np.array([image.camera_id for image in images], dtype=np.int64),
         image_focal_px=np.array([mean_focal_px(reconstruction.cameras[image.camera_id]) for image in images]),
         observation_start=np.concatenate([[0], np.cumsum(points["n"])]).astype(np.int64),
         observation_image=np.searchsorted(image_ids, elements[:, 0]),
@@ -361,15 +365,19 @@ def colmap_poses(model_dir: str | Path, reconstruction: Any = None) -> Float:
     return np.stack([image.cam_from_world().matrix() for image in posed])
 
 
-def camera_of_model(reconstruction: Any, path: Path, camera_id: int | None = None) -> Camera:
-    """The camera of a pycolmap model with an id, or its only camera. Raises MapError, naming the model, if there is none."""
-    known = cameras_by_id(reconstruction.cameras, path)
-    if camera_id is None:
-        return only_camera(known, path)
-    if camera_id not in known:
-        fix = f"It has {', '.join(map(str, known))}."
-        raise MapError("the model has no such camera", path=path, value=camera_id, fix=fix)
-    return known[camera_id]
+def find_camera(cameras: Mapping[int, Camera], path: Path, camera: Camera | int | None = None) -> Camera:
+    """Return a camera, given as one or by its id among those of a model; None for the only one.
+
+    Raises MapError, naming the model's folder, if there is no such camera, or there are several.
+    """
+    if camera is None:
+        return only_camera(cameras, path)
+    if not isinstance(camera, int):
+        return camera
+    if camera not in cameras:
+        fix = f"It has {', '.join(map(str, cameras))}."
+        raise MapError("the model has no such camera", path=path, value=camera, fix=fix)
+    return cameras[camera]
 
 
 def registered_names(reconstruction: Any) -> dict[int, str]:
@@ -391,12 +399,6 @@ def holds_model(folder: Path) -> bool:
 def save_mapping_poses(cam_from_world: Float, path: str | Path) -> None:
     """Write poses (M, 3, 4) as an NPZ file, see `compact_poses`, atomically. The same poses give the same bytes."""
     save_npz(Path(path), {"cam_from_world": compact_poses(cam_from_world)})
-
-
-def cameras_of_images(model_dir: Path, reconstruction: Any) -> tuple[Camera, ...]:
-    """Return the cameras (M,) of the images whose poses `colmap_poses` returns."""
-    cameras = cameras_by_id(reconstruction.cameras, model_dir)
-    return tuple(cameras[image.camera_id] for _, image in sorted(reconstruction.images.items()) if image.has_pose)
 
 
 def compact_poses(cam_from_world: Float) -> Float:

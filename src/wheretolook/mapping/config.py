@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, field, fields
 from math import inf
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from wheretolook.features.config import ExtractorConfig
 from wheretolook.geometry.camera import CameraConfig
-from wheretolook.utils.errors import ConfigError, check_positive, check_range, reject
+from wheretolook.utils.errors import ConfigError, check_positive, check_range, no_option, reject
 
 # The walk of a person with a camera through a scene.
 COVERAGE = 0.7  # share of the reachable floor that is visited; the walk ends there
@@ -150,15 +150,46 @@ class FrameOptions:
 
 
 @dataclass(frozen=True)
-class PhotographsConfig:
-    """How a folder of photographs is mapped. Without one, maps are made of rendered images.
+class SourceImages:
+    """The images that a map is made from, and how its frame is related to metres with z up.
 
     Args:
         images: folder of the photographs, with any subfolders.
-        name: name of the scene; by default that of the folder, and for images, rgb and the like that of the parent
-            folder.
         max_side_px: photographs are reduced to this many pixels along their longer side; 0 keeps their size. The map's
             cameras and keypoints are those of the reduced photographs.
+        scale: markers that give the scale.
+        frame: how the map's frame is related to metres with z up.
+        extractor: keypoints and descriptors; queries must use the same.
+        keep_database: keep COLMAP's database of keypoints and matches, as `database.db`.
+    """
+
+    images: Path | None = None
+    max_side_px: int = 1600
+    scale: MarkerConfig = field(default_factory=MarkerConfig)
+    frame: FrameOptions = no_option(FrameOptions())
+    extractor: ExtractorConfig = no_option(ExtractorConfig())
+    keep_database: bool = no_option(False)
+
+    two_view_landmarks: ClassVar[bool] = True
+
+    def __post_init__(self) -> None:
+        check_range("max_side_px", self.max_side_px, 0)
+        frame = self.frame
+        has_scale = any((frame.scale, frame.distance, frame.positions))
+        reject((self.scale.has_sizes and has_scale, "the scale is given twice: leave out marker sizes", None))
+
+    def report(self) -> dict[str, Any]:
+        """Settings as `report.json` has them."""
+        settings = asdict(self)
+        shared = {name: settings.pop(name) for name in ("frame", "extractor", "keep_database")}
+        return {**shared, "photographs": settings}
+
+
+@dataclass(frozen=True)
+class PhotographsConfig(SourceImages):
+    """How a folder of photographs is mapped.
+
+    Args:
         camera_model: COLMAP's name of the camera model.
         camera_params: the camera model's parameters, for a photograph of full size, in COLMAP's order; they stay fixed.
             Without them, they are refined from the EXIF focal length, or from 1.2 times the longer side where there is
@@ -169,89 +200,77 @@ class PhotographsConfig:
             not reach the 0.5 px of rendered images.
         up_in_camera: the direction up in the camera frame, if it is the same for all. (x, y, z) with x right, y down, z
             forward: (0, 0, -1) for cameras that look straight down. By default cameras are held level, with any pitch.
-        scale: markers that give the scale.
     """
 
-    images: Path | None = None
-    name: str = ""
-    max_side_px: int = 1600
     camera_model: str = "SIMPLE_RADIAL"
     camera_params: tuple[float, ...] = ()
     shared_camera: bool = True
-    overlap: int = 10
-    max_reprojection_error_px: float = 2.0
+    overlap: int = no_option(10)
+    max_reprojection_error_px: float = no_option(2.0)
     up_in_camera: tuple[float, float, float] | None = None
-    scale: MarkerConfig = field(default_factory=MarkerConfig)
 
     def __post_init__(self) -> None:
-        check_range("max_side_px", self.max_side_px, 0)
+        super().__post_init__()
         check_range("overlap", self.overlap, 1)
         check_positive("max_reprojection_error_px", self.max_reprojection_error_px)
         if self.up_in_camera is not None and not 0 < sum(abs(value) for value in self.up_in_camera) < inf:
             raise ConfigError("up_in_camera must be a direction", value=self.up_in_camera)
+        if given := self.frame.scale or self.frame.up:
+            problem = "photographs have no unit or axes: give distance, positions or marker sizes, and up_in_camera"
+            raise ConfigError(problem, value=given)
 
     def record(self) -> dict[str, Any]:
         """Settings and constants, from which the keys of finished maps are made."""
         scale = {**asdict(self.scale), "tolerance_percent": SCALE_TOLERANCE_PERCENT}
-        return {**asdict(self), "scale": scale, "exhaustive_up_to": EXHAUSTIVE_UP_TO}
+        settings = self.report()["photographs"]
+        return {**settings, "scale": scale, "exhaustive_up_to": EXHAUSTIVE_UP_TO}
 
 
 @dataclass(frozen=True)
-class ExistingModelConfig:
-    """An existing COLMAP model with known poses, from which a scene is made instead of from a mesh or photographs.
+class ImportConfig(SourceImages):
+    """An existing COLMAP model with known poses, from which a map is made.
 
-    The scene is in metres, z up, according to `mapping.frame`, or to the markers of `photographs.scale`. With `photographs.images`, the
-    folder of its images, its landmarks are triangulated again at its poses, from keypoints of `extractor`.
+    With `images`, its landmarks are triangulated again at its poses, from keypoints of `extractor`.
 
     Args:
         model: folder of the model.
-        name: name of the scene; by default that of the folder. For sparse/0 and the like that of the parent folder.
         database: the COLMAP database that the model was built from, or hloc's features in HDF5. Descriptors give the
             ambiguity of landmarks, and queries are matched with them.
-        mesh: textured mesh of the scene in the model's frame, for free space, occlusion and labels. Without one, free
-            space follows `scenes.mapped_space`, and occlusion hidden-point removal.
-        mesh_up: which axis of the mesh's file is the model's z: x, y or z, with a minus sign if it points down.
-        camera_id: the query camera, if the model has several and `camera` names none.
-        max_reprojection_error_px: landmarks with a larger mean reprojection error are removed; 0 keeps all.
+        max_reprojection_error_px: landmarks with a larger mean reprojection error are removed; 0 keeps all, and with
+            `images` means that of photographs.
     """
 
-    model: Path | None = None
-    name: str = ""
+    model: Path = field(kw_only=True)
     database: Path | None = None
-    mesh: Path | None = None
-    mesh_up: str = "z"
-    camera_id: int | None = None
     max_reprojection_error_px: float = 0.0
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         check_range("max_reprojection_error_px", self.max_reprojection_error_px, 0)
+
+    @property
+    def limit_px(self) -> float:
+        """Landmarks with a larger mean reprojection error are removed; 0 keeps all."""
+        of_images = PhotographsConfig.max_reprojection_error_px if self.images is not None else 0.0
+        return self.max_reprojection_error_px or of_images
+
+    def report(self) -> dict[str, Any]:
+        """Settings as `report.json` has them."""
+        report = super().report()
+        own = ("model", "database", "max_reprojection_error_px")
+        return {**report, "existing": {name: report["photographs"].pop(name) for name in own}}
 
 
 def place_name(folder: Path) -> str:
     """Return the name of a place from the folder of its model or images: the last folder that has a name of its own."""
-    parts = [part for part in folder.resolve().parts[1:] if part not in _GENERIC_NAMES and not part.isdigit()]
+    generic = ["sparse", "model", "models", "sfm", "colmap", "map", "images", "image", "imgs", "rgb", "color", "input"]
+    parts = [part for part in folder.resolve().parts[1:] if part not in generic and not part.isdigit()]
     return parts[-1] if parts else "model"
-
-
-_GENERIC_NAMES = (
-    "sparse",
-    "model",
-    "models",
-    "sfm",
-    "colmap",
-    "map",
-    "images",
-    "image",
-    "imgs",
-    "rgb",
-    "color",
-    "input",
-)
 
 
 @dataclass(frozen=True)
 class MapConfig:
-    """How a scene is mapped.
+    """How a mesh is mapped, by images rendered along a walk.
 
     Args:
         n_images: images rendered along the walk.
@@ -260,11 +279,6 @@ class MapConfig:
             a third as many landmarks, and fewer viewpoints that localize.
         max_reprojection_error_px: landmarks with a larger mean reprojection error are removed from the map (the
             paper's 0.5 px).
-        photographs: a folder of photographs to map instead of a mesh; of the other settings, only `extractor` and
-            `keep_database` then count; `camera`, `draw_camera`, `vary`, `appearance` and `keep_images` are rejected.
-        existing: an existing model to import instead; then only `extractor`, `keep_database`, `frame` and
-            `photographs.images` and `.scale` also count.
-        frame: how the frame of an existing model, or of photographs, is related to metres with z up.
         camera: the mapping camera, if not the query camera, such as `{width: 1280, height: 720, fov_deg: 70}`.
         draw_camera: draw the mapping camera from the scene's seed, as `sample.cameras` draws query cameras.
         vary: draw from the scene's seed how it is photographed: on a walk through a part of it or all, with even spacing
@@ -278,11 +292,8 @@ class MapConfig:
 
     n_images: int = 100
     extractor: ExtractorConfig = field(default_factory=ExtractorConfig)
-    two_view_landmarks: bool = True
-    max_reprojection_error_px: float = 0.5
-    photographs: PhotographsConfig = field(default_factory=PhotographsConfig)
-    existing: ExistingModelConfig = field(default_factory=ExistingModelConfig)
-    frame: FrameOptions = FrameOptions()
+    two_view_landmarks: bool = no_option(True)
+    max_reprojection_error_px: float = no_option(0.5)
     camera: CameraConfig | None = None
     draw_camera: bool = False
     vary: bool = False
@@ -296,22 +307,21 @@ class MapConfig:
             raise ConfigError("give camera or draw_camera, not both", value=self.camera)
         check_positive("max_reprojection_error_px", self.max_reprojection_error_px)
         check_range("mapping.appearance", self.appearance, 0, 1)
-        frame = self.frame
-        has_scale = any((frame.scale, frame.distance, frame.positions))
-        of_photographs = "photographs have no unit or axes: give distance, positions or marker sizes, and up_in_camera"
-        no_model = self.existing.model is None
-        of_renders = ("camera", "draw_camera", "vary", "appearance", "keep_images")
-        given = [f"mapping.{name}" for name in of_renders if getattr(self, name)]
-        is_rendered = no_model and self.photographs.images is None
-        reject(
-            (self.photographs.scale.has_sizes and has_scale, "the scale is given twice: leave out marker sizes", None),
-            (not is_rendered and bool(given), "these are for maps of renders, not of photographs or a model", given),
-            (no_model and bool(frame.scale or frame.up), of_photographs, frame.scale or frame.up),
-        )
+
+    @property
+    def of_renders(self) -> list[str]:
+        """Names of the options given that are for maps of renders only."""
+        names = ("camera", "draw_camera", "vary", "appearance", "keep_images")
+        return [f"mapping.{name}" for name in names if getattr(self, name)]
+
+    def report(self) -> dict[str, Any]:
+        """Settings as `report.json` has them."""
+        return asdict(self)
 
     def record(self) -> dict[str, Any]:
-        """Settings and constants, from which the keys of finished maps are made."""
+        """Settings and constants, from which the keys of finished maps are made; without the mapping camera."""
         settings = asdict(self)
+        del settings["camera"], settings["draw_camera"]
         for name in ("vary", "appearance"):  # maps made before these options existed keep their keys
             if not settings[name]:
                 del settings[name]
@@ -319,7 +329,6 @@ class MapConfig:
             **settings,
             "walk": _WALK_RECORD,
             "extractor": self.extractor.record(),
-            "photographs": self.photographs.record(),
             "partners": PARTNERS,
             "max_epipolar_error_px": MAX_EPIPOLAR_ERROR_PX,
             "min_triangulation_angle_deg": MIN_TRIANGULATION_ANGLE_DEG,

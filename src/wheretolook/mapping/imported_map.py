@@ -18,7 +18,7 @@ from wheretolook.mapping.colmap_model import (
     read_model,
     registered_names,
 )
-from wheretolook.mapping.config import EXHAUSTIVE_UP_TO, PARTNERS, MapConfig
+from wheretolook.mapping.config import EXHAUSTIVE_UP_TO, PARTNERS, ImportConfig
 from wheretolook.mapping.georeference import MapScale, MarkedPhotographs, check_tables
 from wheretolook.mapping.map_folder import DATABASE_FILE, MapDraft, MapReport, MapRun, finish_map, replacing_map
 from wheretolook.mapping.map_frame import IDENTITY, find_frame
@@ -28,7 +28,7 @@ from wheretolook.utils.errors import ConfigError, MapError
 from wheretolook.utils.files import image_size, path_within
 
 _EITHER = "Leave --database out to triangulate again, or --images to keep the model's landmarks."
-_FIX = "Raise mapping.existing.max_reprojection_error_px, or check the model's poses and intrinsics."
+_FIX = "Raise `ImportConfig.max_reprojection_error_px`, or check the model's poses and intrinsics."
 _PROPORTION_TOLERANCE = 0.01  # between the proportions of a photograph and of its camera
 _EXIF_ORIENTATION = 274
 _SIDEWAYS = (5, 6, 7, 8)  # values of EXIF's orientation for photographs that are stored on a side
@@ -48,7 +48,7 @@ class ExistingMapReport(MapReport):
 
 
 def map_existing(
-    config: MapConfig,
+    config: ImportConfig,
     out_dir: str | Path = "map",
     work: Path = Path("photographs"),
     seed: int = 0,
@@ -57,62 +57,58 @@ def map_existing(
     progress: bool = True,
     reconstruction: Any = None,
 ) -> ExistingMapReport:
-    """Make a map of the COLMAP model in `config.existing.model`; `reconstruction` is that model, if read already.
+    """Make a map of the COLMAP model in `config.model`; `reconstruction` is that model, if read already.
 
     Writes what `build_map` writes. Without images it is the model itself, with its rigs. With
-    `config.photographs.images`, its images have the same poses and names, but ids from 1 and the reduced size; their
+    `config.images`, its images have the same poses and names, but ids from 1 and the reduced size; their
     keypoints are cached in `work`. A `MapWarning` reports omitted points, and doubts about metres or z up.
     Raises MapError if the model, the database or an image cannot be used, nothing gives the requested scale, or
     `out_dir` holds something else; ConfigError for settings that exclude one another.
     """
-    settings = config.existing
-    photographs = config.photographs
-    if settings.model is None:
-        raise ConfigError("no model was named", fix="Set mapping.existing.model.")
-    if photographs.images is not None and settings.database is not None:
+    images = config.images
+    if images is not None and config.database is not None:
         raise ConfigError("images give new keypoints, which a database does not describe", fix=_EITHER)
-    check_tables(photographs.scale, config.frame)
+    check_tables(config.scale, config.frame)
     with replacing_map(config, out_dir, seed, workers, device, progress) as (folder, run):
         with run.clock("read"):
-            model = reconstruction or read_model(settings.model)
+            model = reconstruction or read_model(config.model)
             n_points = model.num_points3D()
-        database = settings.database
-        limit_px = settings.max_reprojection_error_px
+        database = config.database
         turned = True
-        if photographs.images is not None:
-            turned = _are_turned(model, photographs.images)
+        if images is not None:
+            turned = _are_turned(model, images)
             database = folder / DATABASE_FILE
-            model = _triangulate(model, photographs.images, turned, work, database, run)
-            limit_px = limit_px or photographs.max_reprojection_error_px
+            with run.clock("extract"):
+                names = list(registered_names(model).values())
+                features = photograph_features(images, work, run, config.max_side_px, names, turned)
+            model = _triangulate(model, images, features, database, run)
         with run.clock("frame"):
-            marked = MarkedPhotographs(photographs.scale, photographs.images, turned, progress)
-            frame = find_frame(settings.model, model, config.frame, photographs=marked)
+            marked = MarkedPhotographs(config.scale, images, turned, progress)
+            frame = find_frame(config.model, model, config.frame, photographs=marked)
             frame.world_from_map.transform_model(model)
-        if limit_px and not all(point.has_error() for point in model.points3D.values()):
+        if config.limit_px and not all(point.has_error() for point in model.points3D.values()):
             model.update_point_3d_errors()
-        draft = MapDraft(model, settings.model, limit_px, _FIX, database, search_device=device)
+        draft = MapDraft(model, config.model, config.limit_px, _FIX, database, search_device=device)
         landmarks, fields = finish_map(draft, folder, run)
-        poses = colmap_poses(settings.model, model)
+        poses = colmap_poses(config.model, model)
         report = ExistingMapReport(
             n_images=len(poses),
             **fields,
             seconds=run.clock.with_total(),
             n_points=n_points,
-            triangulated_anew=photographs.images is not None,
+            triangulated_anew=images is not None,
             has_descriptors=landmarks.descriptors is not None,
             cameras=describe_cameras(model),
             frame=frame.record(),
             scale=frame.scale,
         )
         report.save(folder)
-    IDENTITY.warn(settings.model, landmarks.mapping_distance_m, poses)
+    IDENTITY.warn(config.model, landmarks.mapping_distance_m, poses)
     return report
 
 
-def _triangulate(source: Any, images: Path, turned: bool, work: Path, database: Path, run: MapRun) -> Any:
+def _triangulate(source: Any, images: Path, features: PhotographFeatures, database: Path, run: MapRun) -> Any:
     """Triangulate new landmarks at the poses of a model, from keypoints of its images. Returns a new model."""
-    with run.clock("extract"):
-        features = photograph_features(images, work, run, list(registered_names(source).values()), turned)
     with run.clock("pairs"):
         pairs = _pairs(source)
     model = triangulate_model(database, _posed_model(source, features), features.stored, features.colors, pairs, run)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wheretolook.mapping.colmap_model import CAMERAS_FILE, colmap_poses, save_mapping_poses, write_model
-from wheretolook.mapping.config import MapConfig
+from wheretolook.mapping.config import MapConfig, SourceImages
 from wheretolook.mapping.feature_files import DATABASE_FILE, HDF5_SUFFIXES
 from wheretolook.mapping.georeference import REPORT_FILE
 from wheretolook.mapping.landmarks import Landmarks, load_colmap_landmarks
@@ -47,7 +47,7 @@ class Clock:
 class MapRun:
     """Settings and resources that all steps of making one map share."""
 
-    config: MapConfig
+    config: MapConfig | SourceImages
     processes: WorkerPool
     seed: int = 0
     device: str = "cpu"  # that extracts keypoints
@@ -88,7 +88,7 @@ class MapReport:
 
 @contextmanager
 def replacing_map(  # the parts of a `MapRun`, and the folder
-    config: MapConfig,
+    config: MapConfig | SourceImages,
     out_dir: str | Path,
     seed: int,
     workers: int,
@@ -136,7 +136,7 @@ def finish_map(draft: MapDraft, folder: Path, run: MapRun) -> tuple[Landmarks, d
         "median_track_length": float(np.median(landmarks.track_length)),
         "mean_reprojection_error_px": float(landmarks.reprojection_error_px.mean()),
         "seed": run.seed,
-        "config": asdict(run.config),
+        "config": run.config.report(),
     }
 
 

@@ -63,7 +63,7 @@ def mesh_warning(points: ArrayLike, raycaster: MeshRaycaster) -> str:
     return (
         f"half of the landmarks are {far} from the mesh, so it seems to be in another frame or unit than the model. "
         "Export both in the same frame and unit; a mesh with y up (glTF's own) `wheretolook map --model` "
-        "turns with --mapping.existing.mesh_up y"
+        "turns with --mesh-up y"
     )
 
 
@@ -121,8 +121,13 @@ class MapFrame:
 
     def of_arrays(self, arrays: ModelArrays) -> ModelArrays:
         """Return arrays of the model in the world."""
-        centers = self.world_from_map.apply(arrays.image_centers)
-        return replace(arrays, points=self.world_from_map.apply(arrays.points), image_centers=centers)
+        to_world = self.world_from_map
+        return replace(
+            arrays,
+            points=to_world.apply(arrays.points),
+            image_poses=to_world.apply_to_poses(arrays.image_poses),
+            image_centers=to_world.apply(arrays.image_centers),
+        )
 
     def record(self) -> dict[str, Any]:
         """Return the frame as JSON values, from which `read_frame` makes it."""

@@ -17,7 +17,7 @@ from wheretolook.features.registry import kind_of
 from wheretolook.geometry.poses import camera_centers
 from wheretolook.geometry.similarity import Similarity
 from wheretolook.mapping.colmap_model import colmap_poses, describe_cameras, read_model, registered_names, write_model
-from wheretolook.mapping.config import EXHAUSTIVE_UP_TO, MapConfig
+from wheretolook.mapping.config import EXHAUSTIVE_UP_TO, PhotographsConfig
 from wheretolook.mapping.georeference import MapScale, MarkedPhotographs, check_tables
 from wheretolook.mapping.gravity import estimate_gravity
 from wheretolook.mapping.map_folder import MapDraft, MapReport, MapRun, finish_map, replacing_map
@@ -63,7 +63,7 @@ class MappedPhotographs:
 
 
 def photograph_features(
-    folder: Path, work: Path, run: MapRun, names: list[str] | None = None, turned: bool = True
+    folder: Path, work: Path, run: MapRun, max_side_px: int, names: list[str] | None = None, turned: bool = True
 ) -> PhotographFeatures:
     """Extract keypoints of photographs in a folder, at most `max_side_px` large; those of a finished run are reused.
 
@@ -74,8 +74,8 @@ def photograph_features(
     extractor = run.config.extractor
     stats = [(folder / name).stat() for name in names]
     files = [(name, stat.st_size, stat.st_mtime_ns) for name, stat in zip(names, stats, strict=True)]
-    key = cache_key(_VERSION, files, run.config.photographs.max_side_px, extractor.record(), turned)
-    arrays = _cached_arrays(work, key, "features", lambda: _extract(folder, names, turned, run))
+    key = cache_key(_VERSION, files, max_side_px, extractor.record(), turned)
+    arrays = _cached_arrays(work, key, "features", lambda: _extract(folder, names, turned, max_side_px, run))
     ends = np.cumsum(arrays["counts"])[:-1]
     pixels, descriptors, colors = (np.split(arrays[name], ends) for name in ("pixels", "descriptors", "colors"))
     stored = list(zip(pixels, descriptors, strict=True))
@@ -84,7 +84,7 @@ def photograph_features(
 
 
 def map_incrementally(
-    work: Path, features: PhotographFeatures, cameras: PhotographCameras, run: MapRun
+    work: Path, features: PhotographFeatures, cameras: PhotographCameras, overlap: int, run: MapRun
 ) -> MappedPhotographs:
     """Match photographs, verify the matches, and map incrementally (Schonberger and Frahm, CVPR 2016).
 
@@ -92,7 +92,7 @@ def map_incrementally(
     Raises MapError if the photographs do not overlap enough for a map.
     """
     seed = run.seed % 2**31  # COLMAP keeps it in an int
-    pairs = photograph_pairs(len(features.names), EXHAUSTIVE_UP_TO, run.config.photographs.overlap)
+    pairs = photograph_pairs(len(features.names), EXHAUSTIVE_UP_TO, overlap)
     key = cache_key(features.key, pairs.tolist())
     database = work / "database.db"
 
@@ -129,14 +129,14 @@ def _cached_arrays(
     return (cache.load(name) or cache.store({name: compute()}))[name]
 
 
-def _extract(folder: Path, names: list[str], turned: bool, run: MapRun) -> dict[str, NDArray[Any]]:
+def _extract(folder: Path, names: list[str], turned: bool, max_side_px: int, run: MapRun) -> dict[str, NDArray[Any]]:
     """Sizes, keypoints, descriptors and colours of photographs, as the arrays of `features.npz`."""
     sizes = []
 
     def images() -> Iterator[NDArray[np.uint8]]:
         for name in names:
             rgb = read_photograph(folder / name, turned)
-            reduced = reduce_photograph(rgb, run.config.photographs.max_side_px)
+            reduced = reduce_photograph(rgb, max_side_px)
             sizes.append((rgb.shape[1::-1], reduced.shape[1::-1]))
             yield reduced
 
@@ -196,7 +196,7 @@ def _reconstruct(database: Path, folder: Path, cameras: PhotographCameras, seed:
     return [model.num_reg_images() for model in ordered]
 
 
-_FIX = "Raise mapping.photographs.max_reprojection_error_px, or take sharper photographs."
+_FIX = "Raise `PhotographsConfig.max_reprojection_error_px`, or take sharper photographs."
 
 
 @dataclass(frozen=True)
@@ -214,7 +214,7 @@ class PhotographMapReport(MapReport):
 
 
 def map_photographs(
-    config: MapConfig,
+    config: PhotographsConfig,
     out_dir: str | Path = "map",
     work: Path = Path("photographs"),
     seed: int = 0,
@@ -223,37 +223,37 @@ def map_photographs(
     progress: bool = True,
     before_replace: Callable[[], None] = lambda: None,
 ) -> PhotographMapReport:
-    """Map the photographs in `config.photographs.images`.
+    """Map the photographs in `config.images`.
 
     Writes what `build_map` writes, z up, and in metres if the report's scale has a source. Unless positions are given,
     the origin is the mean of the cameras' positions and the heading is arbitrary. Finished steps are cached in `work`.
     With one worker the same seed gives the same map; with more, COLMAP's bundle adjustment sums in any order. Raises
     MapError if photographs are unreadable, do not overlap or do not give the scale; ConfigError for invalid settings.
     """
-    settings = config.photographs
-    if settings.images is None:
-        raise ConfigError("no folder of photographs was named", fix="Set mapping.photographs.images.")
-    check_tables(settings.scale, config.frame)  # before the work
+    images = config.images
+    if images is None:
+        raise ConfigError("no folder of photographs was named", fix="Give --images.")
+    check_tables(config.scale, config.frame)  # before the work
     with replacing_map(config, out_dir, seed, workers, device, progress, before_replace) as (folder, run):
         with run.clock("extract"):
-            features = photograph_features(settings.images, work, run)
+            features = photograph_features(images, work, run, config.max_side_px)
         with run.clock("map"):
-            cameras = photograph_cameras(settings.images, features.names, features.full_sizes, features.sizes, settings)
-            mapped = map_incrementally(work, features, cameras, run)
+            cameras = photograph_cameras(images, features.names, features.full_sizes, features.sizes, config)
+            mapped = map_incrementally(work, features, cameras, config.overlap, run)
         model = mapped.model
         with run.clock("gravity"):
             poses = colmap_poses(work, model)
-            gravity = estimate_gravity(poses, settings.up_in_camera)
+            gravity = estimate_gravity(poses, config.up_in_camera)
             center = camera_centers(poses).mean(0)
             Similarity(1.0, gravity.rotation, -gravity.rotation @ center).transform_model(model)
         with run.clock("scale"):
-            photographs = MarkedPhotographs(settings.scale, settings.images, progress=progress)
+            photographs = MarkedPhotographs(config.scale, images, progress=progress)
             options = config.frame if config.frame.positions else replace(config.frame, up="z")
             frame = find_frame(work, model, options, photographs=photographs)
             frame.world_from_map.transform_model(model)
             model.update_point_3d_errors()
         out_dir = Path(out_dir)
-        draft = MapDraft(model, out_dir, settings.max_reprojection_error_px, _FIX, mapped.database, features.colors)
+        draft = MapDraft(model, out_dir, config.max_reprojection_error_px, _FIX, mapped.database, features.colors)
         landmarks, fields = finish_map(draft, folder, run)
         registered = set(registered_names(model).values())
         report = PhotographMapReport(

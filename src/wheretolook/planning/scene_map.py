@@ -13,8 +13,8 @@ from numpy.typing import ArrayLike, NDArray
 from tqdm.auto import tqdm
 
 from wheretolook.dataset.config import Accuracy
-from wheretolook.dataset.environment import Environment
 from wheretolook.dataset.layout import Dataset
+from wheretolook.dataset.scene import Scene
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.lattices import ViewLattice, VoxelGrid
 from wheretolook.geometry.poses import Float, poses_looking_along, rotation_looking_along, transform
@@ -139,7 +139,7 @@ INSIDE = np.stack(np.meshgrid(*[(-1 / 3, 0.0, 1 / 3)] * 3, indexing="ij"), -1).r
 
 
 def scene_scorer(
-    scene: Environment,
+    scene: Scene,
     method: str = "",
     weights: Path | None = None,
     anywhere: bool = False,
@@ -160,7 +160,7 @@ def scene_scorer(
     return scorer if accuracy is None else scorer.at_accuracy(accuracy)
 
 
-def scene_viewpoint_map(scene: Environment, views: ViewLattice, scorer: Scorer) -> ViewpointMap:
+def scene_viewpoint_map(scene: Scene, views: ViewLattice, scorer: Scorer) -> ViewpointMap:
     """Build the viewpoint map of a scene by a scorer of its views, with progress bars.
 
     Raises SceneError if no voxel is free, MapError if there are no landmarks.
@@ -169,7 +169,7 @@ def scene_viewpoint_map(scene: Environment, views: ViewLattice, scorer: Scorer) 
     return build_viewpoint_map(scorer, grid, free, views.axes(), views.lattice, f"viewpoint map {scene.name}")
 
 
-def planner_map(scene: Environment, views: ViewLattice, scorer: Scorer) -> ViewpointMap:
+def planner_map(scene: Scene, views: ViewLattice, scorer: Scorer) -> ViewpointMap:
     """Build the map for planners: scores in [0, 1], and views wherever a camera can be.
 
     Scores that are no probabilities are replaced by ranks, and partially free voxels are filled. Raises as
@@ -226,7 +226,7 @@ def fill_partially_free_voxels(viewpoint_map: ViewpointMap, space: Space) -> Vie
 
 
 def plan_by_methods(
-    scene: Environment,
+    scene: Scene,
     dataset: Dataset | None,
     methods: Iterable[str],
     start: ArrayLike,

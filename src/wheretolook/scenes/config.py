@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from wheretolook.utils.errors import check_positive, check_range
+from wheretolook.utils.errors import check_positive, check_range, no_option
 
 SceneKind = Literal["apartment", "hall", "court", "office", "building"]
 
@@ -26,26 +26,26 @@ class ApartmentConfig:
             such views are full of features and yet hard to localize.
         dark_rooms: share of rooms whose lamp is off, some with their curtains closed. Higher is harder.
         enlarged: scale factor of everything, furniture and patterns included: halls with few, far landmarks.
-        vary: draw the area and the five numbers above from each apartment's seed, whatever they are set to, so that
-            training scenes differ in size and difficulty.
+        vary: draw area, texture, clutter, repetition, dark rooms and scale from each apartment's seed, whatever they are
+            set to, so that training scenes differ in size and difficulty.
         texels_per_m: texture resolution of large surfaces; lowered if the atlas would not fit.
         texture_size: greatest width and height of the texture in texels.
         light_spacing_m: distance between light samples in metres.
         light_rays: rays per light sample over the hemisphere.
     """
 
-    n_rooms: int | None = None
-    area_m2: float | None = None
-    texture_richness: float = 0.85
-    clutter: float = 0.85
-    repetition: float = 0.0
-    dark_rooms: float = 0.2
-    enlarged: float = 1.0
+    n_rooms: int | None = no_option(None)
+    area_m2: float | None = no_option(None)
+    texture_richness: float = no_option(0.85)
+    clutter: float = no_option(0.85)
+    repetition: float = no_option(0.0)
+    dark_rooms: float = no_option(0.2)
+    enlarged: float = no_option(1.0)
     vary: bool = False
-    texels_per_m: float = 125.0
-    texture_size: int = 4096
-    light_spacing_m: float = 0.1
-    light_rays: int = 24
+    texels_per_m: float = no_option(125.0)
+    texture_size: int = no_option(4096)
+    light_spacing_m: float = no_option(0.1)
+    light_rays: int = no_option(24)
 
     def __post_init__(self) -> None:
         if self.n_rooms is not None:

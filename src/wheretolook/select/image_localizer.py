@@ -29,9 +29,9 @@ from wheretolook.mapping.colmap_model import ModelArrays, model_arrays, observat
 from wheretolook.mapping.config import FrameOptions
 from wheretolook.mapping.georeference import REPORT_FILE
 from wheretolook.mapping.landmarks import Landmarks, load_colmap_landmarks
+from wheretolook.mapping.map import find_features
 from wheretolook.mapping.map_folder import LANDMARKS_FILE
 from wheretolook.mapping.map_frame import MapFrame, find_frame
-from wheretolook.mapping.mapped_images import find_features
 from wheretolook.select.localized import Localized, QueryImage, QueryImages, distinct_names
 from wheretolook.utils.errors import ConfigError, MapError, PoseError, TableError, from_record
 from wheretolook.utils.files import path_ends, read_json_object, read_text

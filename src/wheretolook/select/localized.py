@@ -16,7 +16,7 @@ from wheretolook.geometry.camera import Camera, PinholeCamera, camera_of, camera
 from wheretolook.geometry.pose_files import images_text
 from wheretolook.geometry.poses import Float, camera_centers, pan_tilt_angles, quaternion_from_rotation
 from wheretolook.localization.rig_localization import JointLocalization
-from wheretolook.mapping.colmap_model import camera_of_model, registered_names
+from wheretolook.mapping.colmap_model import find_camera, registered_names
 from wheretolook.mapping.map_frame import IDENTITY, MapFrame
 from wheretolook.mapping.photographs import read_photograph, reduce_photograph
 from wheretolook.utils.errors import ConfigError, PoseError
@@ -61,7 +61,7 @@ class QueryImages:
         """Return a camera, given as one or by its camera_id. Raises MapError if the model has no such camera."""
         if camera is not None and not isinstance(camera, (int, Camera)):
             raise ConfigError("this is no camera", value=camera, fix="Give a Camera, or a camera_id of the model.")
-        return camera_of_model(self.model, self.folder, camera) if isinstance(camera, int) else camera
+        return None if camera is None else find_camera(self.cameras, self.folder, camera)
 
     def read(self, image: str | Path | NDArray[np.uint8], name: str, camera: Camera | None = None) -> QueryImage:
         """Read a file, or take an array (H, W, 3) uint8 RGB, of a given or known camera.

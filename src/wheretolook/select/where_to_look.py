@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from wheretolook.dataset.config import ACCURACY, Accuracy
-from wheretolook.dataset.environment import ColmapEnvironment, ColmapFiles, EnvironmentConfig
+from wheretolook.dataset.scene import ColmapFiles, Scene, SceneConfig
 from wheretolook.geometry.camera import Camera, PinholeCamera, parse_camera
 from wheretolook.geometry.lattices import Lattice, direction_lattice
 from wheretolook.geometry.poses import Float, camera_centers, rigid_poses
@@ -117,14 +117,12 @@ class WhereToLook:
         mesh, depth, database = (None if file is None else Path(file) for file in (mesh, depth, database))
         options = FrameOptions(**frame)
         files = ColmapFiles(Path(path), mesh, depth, depth_scale, database, max_reprojection_error_px, options)
-        environment = ColmapEnvironment(
-            files, camera, occlusion or "", EnvironmentConfig(occlusion_cache_bytes=1 << 30), device
-        )
-        here = environment.localization_map
+        scene = Scene.of_colmap(files, camera, occlusion, SceneConfig(occlusion_cache_bytes=1 << 30), device)
+        here = scene.localization_map
         weights = resolve_weights(method, weights, here.landmarks.features)
         if not method:
-            return cls(load_scorer(weights, here, anywhere), axes, environment.space, files)
-        return cls(make_scorer(method, here, weights=weights, anywhere=anywhere), axes, environment.space, files)
+            return cls(load_scorer(weights, here, anywhere), axes, scene.space, files)
+        return cls(make_scorer(method, here, weights=weights, anywhere=anywhere), axes, scene.space, files)
 
     @property
     def localization_map(self) -> LocalizationMap:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from math import inf
 from typing import Literal
 
-from wheretolook.utils.errors import ConfigError
+from wheretolook.utils.errors import ConfigError, no_option
 
 Schedule = Literal["constant", "cosine"]
 Keep = Literal["best", "last"]
@@ -32,9 +32,9 @@ class SharedConfig:
 
     methods: tuple[str, ...] = ()
     also: tuple[str, ...] = ()
-    max_error_m: float = 0.05
-    max_error_deg: float = 0.4
-    val_fraction: float = 0.15
+    max_error_m: float = no_option(0.05)
+    max_error_deg: float = no_option(0.4)
+    val_fraction: float = no_option(0.15)
     seed: int = 0
     accelerator: Literal["auto", "cpu", "gpu"] = "auto"
     devices: int = 1
@@ -64,10 +64,10 @@ class FittingConfig:
         l2: factor of the sum of squared weights.
     """
 
-    epochs: int = 20
-    batch_size: int = 512
-    learning_rate: float = 2e-3
-    l2: float = 1e-5
+    epochs: int = no_option(20)
+    batch_size: int = no_option(512)
+    learning_rate: float = no_option(2e-3)
+    l2: float = no_option(1e-5)
 
     def __post_init__(self) -> None:
         check_range(self, "epochs", "batch_size", at_least=1)

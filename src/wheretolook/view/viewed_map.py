@@ -12,17 +12,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from wheretolook.dataset.environment import (
-    ColmapEnvironment,
-    ColmapFiles,
-    Environment,
-    EnvironmentConfig,
-    SceneEnvironment,
-)
+from wheretolook.dataset.scene import ColmapFiles, Scene, SceneConfig
 from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.lattices import direction_lattice
 from wheretolook.geometry.poses import Float, camera_centers
 from wheretolook.mapping.config import FrameOptions
+from wheretolook.mapping.map_frame import IDENTITY, mesh_warning, warn_of_mesh
 from wheretolook.utils.errors import MapError, TableError, WhereToLookError
 from wheretolook.utils.package import WEIGHTS, or_shipped, shipped
 from wheretolook.view import drawing
@@ -249,31 +244,27 @@ def _if_adapted_to(path: Path, landmarks: Landmarks) -> Path | None:
 
 
 class ViewedMap:
-    """An environment with everything else that the viewer shows, computed once for all clients.
+    """A scene with everything else that the viewer shows, computed once for all clients.
 
     `own_weights` are files or folders by their origin, see `AvailableWeights`. Scorers, floors and landmarks in view
     are for one thread only.
     """
 
     def __init__(
-        self,
-        name: str,
-        environment: Environment,
-        own_weights: Mapping[str, Path | None],
-        labels: pd.DataFrame | None = None,
+        self, name: str, scene: Scene, own_weights: Mapping[str, Path | None], labels: pd.DataFrame | None = None
     ) -> None:
         self.name = name
-        self.environment = environment
-        self.weights = AvailableWeights(environment.landmarks.features, own_weights)
+        self.scene = scene
+        self.weights = AvailableWeights(scene.landmarks.features, own_weights)
         self.labels = labels  # labelled viewpoints
         self.paths: Paths = {}  # to show
-        self.landmarks = environment.landmarks
-        self.camera = environment.camera
-        self.frame = environment.frame  # the map's own, of coordinates that are read, shown or saved
-        self.mapping_poses = environment.mapping_poses  # (M, 3, 4) cam_from_world
-        self.mesh = environment.mesh if environment.has_mesh else None
-        self.space = environment.space if environment.has_mesh else environment.mapped_space
-        self.occlusions = tuple(name for name in environment.available_occlusion if name != "tsdf")  # slow to make
+        self.landmarks = scene.landmarks
+        self.camera = scene.camera
+        self.frame = scene.frame  # the map's own, of coordinates that are read, shown or saved
+        self.mapping_poses = scene.map.mapping_poses  # (M, 3, 4) cam_from_world
+        self.mesh = scene.mesh if scene.has_mesh else None
+        self.space = scene.space if scene.has_mesh else scene.mapped_space
+        self.occlusions = tuple(name for name in scene.available_occlusion if name != "tsdf")  # slow to make
         self.bounds = np.array(self.space.bounds, dtype=np.float64)  # (2, 3) m, of free space
         self.landmark_bounds = np.quantile(self.landmarks.points, (0.02, 0.98), axis=0)  # without outliers
         self.size_m = float(np.linalg.norm(np.diff(self.landmark_bounds, axis=0)))
@@ -286,12 +277,10 @@ class ViewedMap:
     @cached_property
     def warnings(self) -> tuple[str, ...]:
         """What was assumed or seems wrong of the map's unit and direction up, and signs that the mesh is in another frame."""
-        from wheretolook.mapping.map_frame import mesh_warning
-
         warnings: tuple[str, ...] = ()
         if self.mapping_poses is not None and len(self.mapping_poses):
-            warnings = self.environment.frame.messages(self.landmarks.mapping_distance_m, self.mapping_poses)
-        if self.mesh is not None and (doubt := mesh_warning(self.landmarks.points, self.environment.raycaster)):
+            warnings = self.scene.frame.messages(self.landmarks.mapping_distance_m, self.mapping_poses)
+        if self.mesh is not None and (doubt := mesh_warning(self.landmarks.points, self.scene.raycaster)):
             warnings = (*warnings, f"The mesh: {doubt}")
         return warnings
 
@@ -332,13 +321,8 @@ class ViewedMap:
 
     @lru_cache(MAX_SCORERS)  # noqa: B019
     def _localization_map(self, occlusion: str) -> LocalizationMap:
-        from wheretolook.inputs.localization_map import LocalizationMap
-
-        model = self.environment.occlusion_model(occlusion)
-        of_map = self.landmarks, self.camera, model, self.environment.device, self.mapping_poses
-        # without the map's own frame: the viewer selects in the world
-        photographs = self.environment.has_photographs
-        return LocalizationMap(*of_map, photographs=photographs, images=self.environment.images)
+        opened = self.scene.with_occlusion(self.scene.occlusion_model(occlusion))
+        return replace(opened, map=replace(opened.map, frame=IDENTITY))  # the viewer selects in the world
 
     @lru_cache(MAX_FLOORS)  # noqa: B019
     def floor(self, method: str, occlusion: str, height_m: float) -> Floor:
@@ -383,7 +367,7 @@ class ViewedMap:
         probabilities.
         """
         if self.mesh is not None:
-            rgb = self.environment.renderer.render(drawing.small_camera(self.camera), pose[None]).rgb[0]
+            rgb = self.scene.renderer.render(drawing.small_camera(self.camera), pose[None]).rgb[0]
             return drawing.picture(rgb, self.camera, visible), "rendered; landmarks by detection probability"
         return drawing.picture(None, self.camera, visible), "landmarks in view by detection probability"
 
@@ -407,17 +391,15 @@ def open_map(
         ConfigError: there is no such camera.
         WeightsError: the weights cannot be used.
     """
-    from wheretolook.mapping.map_frame import warn_of_mesh
-
-    config = EnvironmentConfig(occlusion_cache_bytes=OCCLUSION_BYTES)
-    environment = ColmapEnvironment(ColmapFiles(path, mesh, frame=frame), camera, config=config, device=device)
-    landmarks = environment.landmarks
+    config = SceneConfig(occlusion_cache_bytes=OCCLUSION_BYTES)
+    scene = Scene.of_colmap(ColmapFiles(path, mesh, frame=frame), camera, config=config, device=device)
+    landmarks = scene.landmarks
     if len(landmarks) == 0:
         raise MapError("the map has no landmarks", path=path, fix="Map it again.")
     if mesh is not None:
-        warn_of_mesh(mesh, landmarks.points, environment.raycaster)
+        warn_of_mesh(mesh, landmarks.points, scene.raycaster)
     own = {"given": or_shipped(weights)} if weights else map_weights(path, data, landmarks)
-    return ViewedMap(environment.name, environment, own)
+    return ViewedMap(scene.name, scene, own)
 
 
 def open_scene(
@@ -439,9 +421,9 @@ def open_scene(
     if not files.landmarks.is_file():
         raise MapError("this scene has no map yet", path=files.map, fix="Run `wheretolook map` for its dataset.")
     number, own_camera = next(iter(files.cameras().items()))
-    config = EnvironmentConfig(occlusion_cache_bytes=OCCLUSION_BYTES)
-    environment = SceneEnvironment(files, camera or own_camera, config, device)
-    landmarks = environment.landmarks
+    config = SceneConfig(occlusion_cache_bytes=OCCLUSION_BYTES)
+    scene = Scene(files, camera or own_camera, config, device)
+    landmarks = scene.landmarks
     own = {"given": or_shipped(weights)} if weights else scene_weights(files, landmarks)
     labels = None
     if camera is None and files.table.is_file():
@@ -450,4 +432,4 @@ def open_scene(
         if CAMERA_ID in table:
             shown &= table[CAMERA_ID] == number
         labels = table[shown].reset_index(drop=True) if shown.any() else None
-    return ViewedMap(files.name, environment, own, labels)
+    return ViewedMap(files.name, scene, own, labels)

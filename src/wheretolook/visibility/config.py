@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from wheretolook.utils.errors import ConfigError, check_positive, check_range
+from wheretolook.utils.errors import ConfigError, check_positive, check_range, no_option
 
 DEFAULT_RADIUS = 50.0
 """Greatest mean F1 against the meshes of six mapped scenes. It is flat: from
@@ -13,7 +13,7 @@ DEFAULT_RADIUS = 50.0
 
 @dataclass(frozen=True)
 class OcclusionKind:
-    """What `Environment` needs to make an occlusion model."""
+    """What `Scene` needs to make an occlusion model."""
 
     model: str  # "module:class"; the class method `from_inputs` makes an instance
     needs: str = ""  # "mesh" or "depth images", if the landmarks are not enough
@@ -56,9 +56,9 @@ class OcclusionConfig:
 
     model: str = "mesh"
     margin_m: float = field(default=0.05, init=False)
-    radius: float = DEFAULT_RADIUS
-    voxel_m: float = 0.02
-    max_depth_m: float = 10.0
+    radius: float = no_option(DEFAULT_RADIUS)
+    voxel_m: float = no_option(0.02)
+    max_depth_m: float = no_option(10.0)
 
     def __post_init__(self) -> None:
         check_occlusion_names((self.model,))

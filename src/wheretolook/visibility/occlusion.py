@@ -79,7 +79,7 @@ def morton_codes(positions: NDArray[np.float64]) -> NDArray[np.int64]:
 
 
 class OcclusionInputs(Protocol):
-    """What an occlusion model can be made from by its class method `from_inputs`; an `Environment` provides it."""
+    """What an occlusion model can be made from by its class method `from_inputs`; a `Scene` provides it."""
 
     @property
     def occlusion_config(self) -> OcclusionConfig: ...

@@ -52,7 +52,7 @@ class Benchmark(Command):
         weights: file or folder of weights; by default the bundled ones.
         directions: number of directions scored at each waypoint.
         lattice: fibonacci (even), or yaw-pitch (ActLoc's 6 x 18).
-        max_turn: greatest rotation from a view to the next in degrees: 30 for evaluate_plan.
+        max_turn_deg: greatest rotation from a view to the next in degrees: 30 for evaluate_plan.
         localizer: sift, or none: leave it to the benchmark's script.
         workers: processes that map; 0 for one on each core.
         device: where to compute: auto, cpu, cuda, or cuda:<index>.
@@ -61,6 +61,7 @@ class Benchmark(Command):
     """
 
     POSITIONAL: ClassVar = "scenes"
+    SHORT: ClassVar = {"max-turn": "max_turn_deg"}
 
     scenes: tuple[Path, ...] = ()
     out: Path = Path("benchmark")
@@ -70,7 +71,7 @@ class Benchmark(Command):
     weights: Path | None = None
     directions: int = 500
     lattice: Literal["fibonacci", "yaw-pitch"] = "fibonacci"
-    max_turn: float | None = None
+    max_turn_deg: float | None = None
     localizer: Literal["sift", "none"] = "sift"
     workers: int = 0
     device: str = "auto"
@@ -87,8 +88,8 @@ class Benchmark(Command):
             raise ConfigError("two scene folders have the same name", value=names)
         check_range("directions", self.directions, 1)
         check_range("workers", self.workers, 0)
-        if self.max_turn is not None:
-            check_range("max_turn", self.max_turn, 0)
+        if self.max_turn_deg is not None:
+            check_range("max_turn", self.max_turn_deg, 0)
 
     def run(self) -> None:
         """Run the benchmark, or score files, and write the report to `out`."""
@@ -124,7 +125,7 @@ class Benchmark(Command):
             self.weights,
             self.directions,
             self.lattice,
-            self.max_turn,
+            self.max_turn_deg,
             localize=self.localizer == "sift",
             workers=self.workers or cores(),
             device=usable_device(self.device),

@@ -37,14 +37,15 @@ class ComparePaths(SceneOptions, LabelOptions):
     """Plan paths between random locations by several methods, render what the camera sees, localize it. Resumes.
 
     Examples:
-      wheretolook compare-paths --config configs/demo.yaml --paths.methods '[forward, set]' --paths.pairs 5
+      wheretolook compare-paths --config configs/demo.yaml --methods forward set --pairs 5
 
     Args:
         paths: which paths, and by which methods.
         tracking: where MLflow keeps its runs.
     """
 
-    SHORT: ClassVar = {"engine": "label.engine"}
+    SHORT: ClassVar = {"engine": "label.engine", "stops": "stops.looks", "paths.scenes": "in_scenes"}
+    GROUPS: ClassVar = {"paths": ""}
 
     paths: PathsConfig = field(default_factory=PathsConfig)
     tracking: TrackingConfig = field(default_factory=TrackingConfig)
@@ -92,9 +93,9 @@ def _comparisons(options: ComparePaths, dataset: Dataset, log: Log) -> list[Scen
     from wheretolook_paper.paths.scene_comparison import SceneComparison
 
     config = options.paths
-    scenes = [dataset.scene(name) for name in config.scenes] or list(dataset.split("test"))
+    scenes = [dataset.scene(name) for name in config.in_scenes] or list(dataset.split("test"))
     if not scenes:
-        raise ConfigError("the dataset has no test scene", path=dataset.root, fix="Name scenes in paths.scenes.")
+        raise ConfigError("the dataset has no test scene", path=dataset.root, fix="Name scenes: --in-scenes.")
     for files in scenes:
         if not files.mesh.is_file():
             raise SceneError("rendering needs a mesh", path=files.folder, fix="Choose other scenes.")

@@ -34,7 +34,7 @@ class Figures(DatasetOptions):
     """
 
     CONFIG: ClassVar = "release"
-    SHORT: ClassVar = {name: f"figures.{name}" for name in ("out", "only", "kinds")}
+    GROUPS: ClassVar = {"figures": ""}
     LISTING: ClassVar = "list"
 
     figures: FiguresConfig = field(default_factory=FiguresConfig)

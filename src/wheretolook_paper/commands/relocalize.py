@@ -20,7 +20,7 @@ from wheretolook.commands.options import (
 from wheretolook.dataset.dataset_lock import reading
 from wheretolook.dataset.layout import Dataset, SceneFolder
 from wheretolook.tracking import TrackingConfig, check_store, kept_if_not_logged
-from wheretolook.utils.errors import ConfigError, SceneError, check_choice, check_range
+from wheretolook.utils.errors import ConfigError, SceneError, check_choice, check_range, no_option
 from wheretolook.utils.files import atomic_write, fingerprint, write_text
 
 if TYPE_CHECKING:
@@ -73,7 +73,7 @@ class Relocalize(SceneOptions):
 
     places: int = 30
     views: int = 4
-    confidence: float = 0.95
+    confidence: float = no_option(0.95)
     policies: tuple[str, ...] = tuple(POLICIES)
     in_scenes: tuple[str, ...] = ()
     method: str = "set"

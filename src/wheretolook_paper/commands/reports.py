@@ -125,8 +125,8 @@ def draw_overview(options: Demo, weights: Path) -> None:
     from wheretolook_paper.styles import method_style
 
     scene = open_scene(options, Dataset.load(options.root).scenes[-1])
-    table = scene.files.read_table()
-    scorer = load_scorer(weights, scene.files.localization_map(scene.camera, scene.device))
+    table = scene.folder.read_table()
+    scorer = load_scorer(weights, scene.folder.localization_map(scene.camera, scene.device))
     ids, first = np.unique(table["location_id"], return_index=True)
     locations = camera_centers(poses(table))[first]
     chosen = instructive_location(table)

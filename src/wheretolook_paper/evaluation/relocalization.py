@@ -15,7 +15,7 @@ import pandas as pd
 from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
-from wheretolook.dataset.environment import SceneEnvironment
+from wheretolook.dataset.scene import Scene
 from wheretolook.dataset.viewpoint_table import LOCALIZED, is_good
 from wheretolook.evaluation.statistics import ClusterBootstrap, precision_area
 from wheretolook.features.config import ExtractorConfig
@@ -99,7 +99,7 @@ class Place:
 class SimulatedRobot:
     """A camera in a scene with a mesh, which localizes by several hypotheses and scores views by any method."""
 
-    def __init__(self, scene: SceneEnvironment, scorer: Scorer, extractor: ExtractorConfig) -> None:
+    def __init__(self, scene: Scene, scorer: Scorer, extractor: ExtractorConfig) -> None:
         self.scene = scene
         self.scorer = scorer
         self.selector = NextLookSelector(scorer, mean_scores_by_pitch(scorer))

@@ -23,7 +23,7 @@ from wheretolook_paper.figures.style import Style
 if TYPE_CHECKING:
     import pandas as pd
 
-    from wheretolook.dataset.environment import SceneEnvironment
+    from wheretolook.dataset.scene import Scene
 
 SCORE_COLORS: Style = {"cmap": "cividis", "vmin": 0, "vmax": 1}
 
@@ -68,7 +68,7 @@ class View:
 
 
 def rendered_views(
-    scene: SceneEnvironment, rows: pd.DataFrame, scores: Float, words: Callable[[pd.Series], str]
+    scene: Scene, rows: pd.DataFrame, scores: Float, words: Callable[[pd.Series], str]
 ) -> tuple[View, ...]:
     """Render B labelled viewpoints (rows of the viewpoint table) with scores (B,) and outcomes described by `words`."""
     cam_from_world = poses(rows)

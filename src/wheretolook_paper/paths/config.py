@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from wheretolook.planning.config import FORWARD, MappedLattice, PathConfig, StopConfig
-from wheretolook.utils.errors import ConfigError, check_positive, check_range
+from wheretolook.utils.errors import ConfigError, check_positive, check_range, no_option
 
 
 @dataclass(frozen=True)
@@ -14,7 +14,7 @@ class PathsConfig(MappedLattice):
     """Options of the comparison of methods by planned paths.
 
     Args:
-        scenes: names of the scenes; none for all of the test split.
+        in_scenes: names of the scenes; none for all of the test split.
         pairs: starts and goals in each scene.
         seed: seed of the starts and goals.
         min_distance_m: least distance of a goal from its start.
@@ -36,17 +36,17 @@ class PathsConfig(MappedLattice):
         odometry_deg_per_deg: standard deviation of its rotation, in degrees per degree.
     """
 
-    scenes: tuple[str, ...] = ()
+    in_scenes: tuple[str, ...] = ()
     pairs: int = 20
     seed: int = 0
-    min_distance_m: float = 3.0
-    height_m: tuple[float, float] = (1.2, 1.6)
+    min_distance_m: float = no_option(3.0)
+    height_m: tuple[float, float] = no_option((1.2, 1.6))
     methods: tuple[str, ...] = (FORWARD, "fisher-trace-gp", "set")
     weights: Path | None = None
     max_turn_deg: float = 30.0
-    max_error_m: float = 0.25
-    max_error_deg: float = 2.0
-    resamples: int = 2000
+    max_error_m: float = no_option(0.25)
+    max_error_deg: float = no_option(2.0)
+    resamples: int = no_option(2000)
     planner: PathConfig = field(default_factory=PathConfig)
     stops: StopConfig = field(default_factory=StopConfig)
     last_views: int = 1

@@ -103,6 +103,35 @@ def _row(of_method: pd.DataFrame, forward: pd.DataFrame, bootstrap: ClusterBoots
     return row
 
 
+def pooled_paths(of_scenes: pd.DataFrame) -> pd.DataFrame:
+    """Combine the rows of scenes in tables of `summarize_paths`: a row for each task and method, scene "all".
+
+    Shares are weighted by views, the ends of their intervals combined as of independent scenes; `times_forward` is the
+    ratio of the shares and has no interval. Lengths are weighted by planned paths, rotations by metres.
+    """
+    rows = []
+    for (task, method), part in of_scenes.groupby(["task", "method"], sort=False):
+        of_views = part["views"] / part["views"].sum()
+        planned = part["pairs"] - part["failures"]
+        of_paths = planned / planned.sum()
+        metres = planned * part["length_m"]
+        localized = (of_views * part["localized"]).sum()
+        below, above = (
+            np.sqrt(((of_views * (part[end] - part["localized"])) ** 2).sum())
+            for end in ("localized_low", "localized_high")
+        )
+        row = {"scene": ALL, "task": task, "method": method, **part[["pairs", "failures", "views"]].sum()}
+        row |= {"localized": localized, "localized_low": localized - below, "localized_high": localized + above}
+        row |= {name: (of_paths * part[name]).sum() for name in ("times_forward_length", "length_m")}
+        row |= {"turn_deg_per_m": (part["turn_deg_per_m"] * metres).sum() / metres.sum()}
+        row |= {"promised": (of_views * part["promised"]).sum(skipna=False)}
+        rows.append(row)
+    table = pd.DataFrame(rows)
+    forward = table[table["method"] == FORWARD].set_index("task")["localized"]
+    table["times_forward"] = table["localized"] / table["task"].map(forward)
+    return table
+
+
 def path_markdown(summary: pd.DataFrame, config: PathsConfig) -> str:
     """Format the summary of `summarize_paths` as Markdown, a table for each task."""
     limits = f"{config.max_error_m:g} m and {config.max_error_deg:g}°"

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from wheretolook.dataset.environment import SceneEnvironment
 from wheretolook.dataset.layout import Dataset
+from wheretolook.dataset.scene import Scene
 from wheretolook.dataset.viewpoint_files import SCHEMA
 from wheretolook.dataset.viewpoint_table import UNLABELLED
 from wheretolook.localization.labeller import MANIFEST, LabelTask
@@ -56,7 +56,7 @@ class SceneComparison:
         log: prints a line of progress.
     """
 
-    scene: SceneEnvironment
+    scene: Scene
     dataset: Dataset
     folder: Path
     config: PathsConfig
@@ -131,7 +131,7 @@ class SceneComparison:
 
     @cached_property
     def _paths_key(self) -> str:
-        files = self.scene.files
+        files = self.scene.folder
         settings = {name: value for name, value in asdict(self.config).items() if name not in _REPORT_OPTIONS}
         scene = self.scene.config
         environment = [asdict(scene.free_space), asdict(scene.occlusion), self.scene.camera.record()]

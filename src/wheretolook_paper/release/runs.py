@@ -187,7 +187,7 @@ def _log_training(
     about = {**record["about"], "dataset": dataset.name}
     params = params_of(about)
     if record["about"]["dataset"] != dataset.name:
-        params["learnt_from"] = record["about"]["dataset"]
+        params["trained_on"] = record["about"]["dataset"]
     tags = {**TAGS, "trained_as": str(record["run_id"])}
     with start_run(tracking, about["method"], "train", params, tags=tags) as (mlflow, run):
         log(mlflow, run, metrics=kept_metrics(record["metrics"]))
@@ -210,7 +210,7 @@ def _log_learners(dataset: Dataset, tracking: TrackingConfig) -> str:
     table[measures] = table[measures].apply(pd.to_numeric)
     nested = []
     of_learner: dict[str, list[tuple[float, float]]] = {}
-    for key, rows in table.groupby(["learner", "learnt_from", "seed"], sort=False):
+    for key, rows in table.groupby(["learner", "trained_on", "seed"], sort=False):
         learner, source, seed = map(str, key)
         numbers: dict[str, float] = {}
         for split, means in rows.groupby("split")[measures].mean().iterrows():
@@ -220,7 +220,7 @@ def _log_learners(dataset: Dataset, tracking: TrackingConfig) -> str:
         if "regret_test" in numbers:
             numbers |= {REGRET: numbers["regret_test"], AUC: numbers["roc_auc_test"]}
             of_learner.setdefault(joined(learner, source), []).append((numbers[REGRET], numbers[AUC]))
-        params = {"dataset": dataset.name, "learner": learner, "learnt_from": source, "seed": seed}
+        params = {"dataset": dataset.name, "learner": learner, "trained_on": source, "seed": seed}
         nested.append(NestedRun(joined(learner, source, f"seed {seed}" if seed else ""), params, numbers))
     tags = dict(TAGS)
     metrics = {}

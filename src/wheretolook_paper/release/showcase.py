@@ -14,10 +14,10 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
-from wheretolook.dataset.environment import EnvironmentConfig, SceneEnvironment
 from wheretolook.dataset.layout import Dataset
 from wheretolook.dataset.sampling import free_locations
 from wheretolook.dataset.sampling_config import SampleConfig
+from wheretolook.dataset.scene import Scene, SceneConfig
 from wheretolook.dataset.viewpoint_table import is_good
 from wheretolook.geometry.lattices import VoxelGrid
 from wheretolook.geometry.poses import Float
@@ -39,7 +39,7 @@ _CHECKED = 16  # locations whose lines of sight are compared
 _SEEDED = re.compile(rf"({'|'.join(get_args(SceneKind))})-(\d+)")
 
 
-class Showcase(SceneEnvironment):
+class Showcase(Scene):
     """A scene of a release with everything that figures need; occlusion is by its mesh."""
 
     sampling: SampleConfig  # how its viewpoints were sampled
@@ -47,7 +47,7 @@ class Showcase(SceneEnvironment):
     @cached_property
     def table(self) -> pd.DataFrame:
         """The scene's viewpoints."""
-        return self.files.read_table()
+        return self.folder.read_table()
 
     @cached_property
     def grid(self) -> VoxelGrid:
@@ -108,7 +108,7 @@ class Showcase(SceneEnvironment):
         """Describe the scene's sizes in a sentence."""
         n_locations = self.table["location_id"].nunique()
         good = is_good(self.table).mean()
-        cameras = "" if self.mapping_poses is None else f" of {len(self.mapping_poses)} images"
+        cameras = "" if self.map.mapping_poses is None else f" of {len(self.map.mapping_poses)} images"
         return (
             f"**{self.name}**: {len(self.mesh.triangles):,} triangles; a map{cameras} with "
             f"{len(self.landmarks):,} landmarks; {len(self.table):,} labelled viewpoints at {n_locations} locations, "
@@ -138,7 +138,7 @@ def open_showcase(dataset: Dataset, name: str | None = None) -> Showcase:
     if seeded is None:
         raise SceneError("this scene was not generated from a seed", path=scene.folder, value=scene.name)
     occlusion = from_record(OcclusionConfig, {**settings["occlusion"], "model": "mesh"})
-    config = EnvironmentConfig(occlusion, from_record(FreeSpaceConfig, settings["scenes"]["free_space"]))
+    config = SceneConfig(occlusion, from_record(FreeSpaceConfig, settings["scenes"]["free_space"]))
     kind = cast(SceneKind, seeded[1])
     apartment = from_record(ApartmentConfig, settings["scenes"]["apartment"])
     mesh, _ = generate_scene(kind, apartment, int(seeded[2]))
@@ -149,13 +149,13 @@ def open_showcase(dataset: Dataset, name: str | None = None) -> Showcase:
     return showcase
 
 
-def _check_same(scene: SceneEnvironment) -> None:
+def _check_same(scene: Scene) -> None:
     """Raise a SceneError if lines of sight differ from the stored ones."""
-    stored = StoredOcclusion.load(scene.files.occlusion)
+    stored = StoredOcclusion.load(scene.folder.occlusion)
     points = scene.landmarks.points
     some = stored.locations[:: max(1, len(stored.locations) // _CHECKED)]
     same = (scene.occlusion.unoccluded(some, points) == stored.unoccluded(some, points)).mean()
     if not same >= SAME_OCCLUSION:
         problem = f"generated from its seed, only {same:.1%} of the lines of sight are as in the labelled scene"
         fix = "Check out the version of the code that release.json names."
-        raise SceneError(problem, path=scene.files.folder, fix=fix)
+        raise SceneError(problem, path=scene.folder.folder, fix=fix)

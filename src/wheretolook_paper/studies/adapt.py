@@ -17,9 +17,9 @@ import pandas as pd
 from jsonargparse import auto_cli
 
 from wheretolook.commands.adapt import labelled_views
-from wheretolook.dataset.environment import SceneEnvironment
 from wheretolook.dataset.layout import Dataset
 from wheretolook.dataset.sampling_config import Split
+from wheretolook.dataset.scene import Scene
 from wheretolook.dataset.viewpoint_table import CAMERA_ID, poses
 from wheretolook.evaluation.adaptation import compare_log_odds
 from wheretolook.scorers.adapted.calibration import calibrate
@@ -45,7 +45,7 @@ def main(
         if scenes and files.name not in scenes:
             continue
         table = files.read_table()
-        scene = SceneEnvironment(files, device="cpu")
+        scene = Scene(files, device="cpu")
         views = labelled_views(files, scene, table, shipped(WEIGHTS) / "set.safetensors")
         numbers = table[CAMERA_ID].to_numpy() if CAMERA_ID in table else np.zeros(len(table), dtype=int)
         bins = np.empty(len(table))

@@ -30,6 +30,7 @@ from wheretolook.geometry.camera import field_of_view_deg
 from wheretolook.geometry.poses import Float, camera_centers
 from wheretolook.scorers.registry import is_probability
 from wheretolook.training.weights import method_of_weights
+from wheretolook_paper.studies.tables import replace_rows
 
 NARROW_DEG = 60
 WIDE_DEG = 95
@@ -141,19 +142,15 @@ def main(
         out: CSV file of the table; rows of other datasets in it are kept.
     """
     paths = [path for path in sorted(weights.glob("*.safetensors")) if not path.stem.startswith("mlp")]
-    tables = []
     for root in datasets:
         table = summary(scored(root, split, methods, paths), list(methods))
         table.insert(0, "dataset", root.name)
         table.insert(1, "split", split)
-        tables.append(table)
         print(f"\n{root.name}, {split}")
         shown = table[(table["group"] == "mean") | table["group"].str.startswith("all ")]
         print(shown.drop(columns=["dataset", "split"]).to_string(index=False, float_format=lambda x: f"{x:.3f}"))
         if out is not None:
-            others = pd.read_csv(out) if out.is_file() else pd.DataFrame({"dataset": []})
-            others = others[~others["dataset"].isin([path.name for path in datasets])]
-            pd.concat([others, *tables]).round(4).to_csv(out, index=False)
+            replace_rows(out, table.round(4), ["dataset"])
 
 
 if __name__ == "__main__":

@@ -42,8 +42,8 @@ from wheretolook.commands.options import MeshSource, ScenesConfig
 from wheretolook.commands.sample import Sample
 from wheretolook.commands.scenes import Scenes
 from wheretolook.dataset.config import Accuracy
-from wheretolook.dataset.environment import SceneEnvironment
 from wheretolook.dataset.sampling_config import SampleConfig
+from wheretolook.dataset.scene import Scene
 from wheretolook.dataset.viewpoint_table import poses as poses_of_table
 from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.evaluation.scoring import score_scenes
@@ -72,7 +72,6 @@ from wheretolook.utils.devices import usable_device
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.files import atomic_write, write_bytes, write_text
 from wheretolook.utils.processes import WorkerPool
-from wheretolook_paper.studies.photographs import posed_model
 
 MATCHERS = {"aliked": "aliked+lightglue", "disk": "disk+lightglue", "opencv": "NN-ratio"}  # of hloc, by extractor
 LABELS = {"aliked": "ALIKED", "disk": "DISK", "opencv": "SIFT"}
@@ -198,16 +197,20 @@ def render_set(source: str, locations: int, images: int, work: Path, workers: in
     names = [*registered_names(model).values()]
     shutil.copytree(scene.map / IMAGES_FOLDER, out / "images", dirs_exist_ok=True)
     queries = {f"query-{row:05d}.png": pose for row, pose in zip(rows, poses_of_table(table)[rows], strict=True)}
-    renderer = SceneEnvironment(scene, device=device).renderer
+    renderer = Scene(scene, device=device).renderer
     for name, pose in tqdm(queries.items(), desc="render queries"):
         (rgb,) = renderer.render(scene.camera, pose[None]).rgb
         write_bytes(out / "images" / name, cv2.imencode(".png", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))[1].tobytes())
-    write_cameras({1: scene.camera}, out / "cameras.txt")
-    poses = [*colmap_poses(scene.map, model), *queries.values()]
-    write_text(out / "images.txt", images_text([*names, *queries], np.stack(poses)))
-    write_text(out / "points3D.txt", "")
+    write_posed(out, scene.camera, dict(zip(names, colmap_poses(scene.map, model), strict=True)) | queries)
     write_text(out / "queries.txt", "".join(f"{name} views\n" for name in queries))
     return out
+
+
+def write_posed(folder: Path, camera: Camera, poses: Mapping[str, Float]) -> None:
+    """Write a COLMAP model of images of one camera at poses (3, 4) by name, without points, as text."""
+    write_cameras({1: camera}, folder / "cameras.txt")
+    write_text(folder / "images.txt", images_text(poses, [*poses.values()]))
+    write_text(folder / "points3D.txt", "")
 
 
 def summarize(table: pd.DataFrame) -> pd.DataFrame:
@@ -281,6 +284,7 @@ def _folds(folder: Path, extractor: KeypointExtractor, partners: int, work: Path
     names = [*registered_names(reference).values()]
     true = dict(zip(names, colmap_poses(folder, reference), strict=True))
     (camera,) = reference.cameras.values()
+    seen_by = camera_of(camera.model_name, camera.width, camera.height, camera.params)
     fold_of = dict(line.split() for line in (folder / "queries.txt").read_text(encoding="utf-8").splitlines())
     method = extractor.config.method
     stored = work / f"feats-{kind_of(method).name}.h5"
@@ -292,68 +296,50 @@ def _folds(folder: Path, extractor: KeypointExtractor, partners: int, work: Path
         pairs = _nearest([*mapping.values()], partners)
         model = out / ("model" if has_hloc else "model-without-hloc")
         if not holds_model(model):
-            own = folder, mapping, pairs, stored, out
+            write_posed(out / "reference", seen_by, mapping)
             if has_hloc:
-                _triangulate_by_hloc(*own, model, MATCHERS[method])
+                _triangulate_by_hloc(out / "reference", folder / "images", pairs, stored, model, MATCHERS[method])
             else:
-                _triangulate(*own, model, extractor.config, workers)
+                _triangulate(out / "reference", pairs, stored, model, extractor.config, workers)
         landmarks = load_colmap_landmarks(model, stored, ambiguity=False)
         queries = {name: true[name] for name in names if fold_of.get(name) == fold}
-        seen_by = camera_of(camera.model_name, camera.width, camera.height, camera.params)
         yield Fold(out, model, stored, landmarks, seen_by, queries)
 
 
 def _triangulate_by_hloc(
-    folder: Path,
-    mapping: Mapping[str, Float],
-    pairs: Sequence[tuple[int, int]],
-    features: Path,
-    out: Path,
-    model: Path,
-    matcher: str,
+    reference: Path, images: Path, pairs: Sequence[tuple[int, int]], features: Path, model: Path, matcher: str
 ) -> None:
-    """Match pairs of images of a set and triangulate at their known poses, all by hloc."""
+    """Match pairs of the images of a reference model and triangulate at its poses, all by hloc."""
     from hloc import match_features, triangulation
 
-    reference = out / "reference"
-    write_text(reference / "cameras.txt", (folder / "cameras.txt").read_text(encoding="utf-8"))
-    write_text(reference / "images.txt", images_text(mapping, [*mapping.values()]))
-    write_text(reference / "points3D.txt", "")
-    pairs_file = out / "pairs.txt"
-    names = [*mapping]
+    pairs_file = reference.parent / "pairs.txt"
+    names = [*registered_names(read_model(reference)).values()]
     write_text(pairs_file, "\n".join(f"{names[a]} {names[b]}" for a, b in pairs))
-    matches = out.parent / "mapping-matches.h5"  # shared by all folds
+    matches = features.with_name("mapping-matches.h5")  # shared by all folds
     match_features.main(match_features.confs[matcher], pairs_file, features, matches=matches)
     # pycolmap 4 ignores the pairs that hloc verifies by the known poses, since it leaves their configuration open
-    triangulation.main(
-        model, reference, folder / "images", pairs_file, features, matches, estimate_two_view_geometries=True
-    )
+    triangulation.main(model, reference, images, pairs_file, features, matches, estimate_two_view_geometries=True)
 
 
 def _triangulate(
-    folder: Path,
-    mapping: Mapping[str, Float],
+    reference: Path,
     pairs: Sequence[tuple[int, int]],
     features: Path,
-    out: Path,
     model: Path,
     extractor: ExtractorConfig,
     workers: int,
 ) -> None:
-    """Match pairs of images of a set and triangulate at their known poses, as the map stage does."""
-    out.mkdir(parents=True, exist_ok=True)
-    (out / DATABASE_FILE).unlink(missing_ok=True)  # of an interrupted run
-    names = [*mapping]
-    _, stored = read_features(features, names)
-    (camera,) = read_model(folder).cameras.values()
-    empty = [(np.empty((0, 2), np.float32), descriptors) for _, descriptors in stored]  # keypoints are added below
-    posed = posed_model(camera, names, dict(enumerate(mapping.values())), empty)
+    """Match pairs of the images of a reference model and triangulate at its poses, as the map stage does."""
+    database = reference.with_name(DATABASE_FILE)
+    database.unlink(missing_ok=True)  # of an interrupted run
+    posed = read_model(reference)
+    _, stored = read_features(features, [*registered_names(posed).values()])
     colors = [np.zeros((len(pixels), 3), np.uint8) for pixels, _ in stored]
     # tracks as long as hloc asks for
     config = MapConfig(extractor=extractor, two_view_landmarks=False)
     with WorkerPool(workers) as processes:
         run = MapRun(config, processes)
-        triangulated = triangulate_model(out / DATABASE_FILE, posed, stored, colors, np.array(pairs), run)
+        triangulated = triangulate_model(database, posed, stored, colors, np.array(pairs), run)
     model.mkdir(parents=True, exist_ok=True)
     triangulated.write_binary(str(model))
 

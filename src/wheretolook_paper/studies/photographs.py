@@ -10,13 +10,15 @@ bundle adjustment then refines them and the focal length, and the result is alig
 
 The table has, for each method, the AUC over all held-out photographs and within blocks, and the regret, with 95 %
 intervals by resampling blocks; for the first method also the calibration error and real over expected inliers. `--out`
-keeps the rows of other scenes, and those of adapted weights. `--work` caches maps and blocks. `wheretolook adapt` measures adapted weights.
+keeps the rows of other scenes, and those of adapted weights; the first method at other accuracies is written beside it.
+`--work` caches maps and blocks. `wheretolook adapt` measures adapted weights.
 """
 
 from __future__ import annotations
 
 import tempfile
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -24,13 +26,15 @@ import numpy as np
 import pandas as pd
 import pycolmap
 from jsonargparse import auto_cli
+from sklearn.metrics import roc_auc_score
 from tqdm.auto import tqdm
 
+from wheretolook.evaluation.statistics import expected_calibration_error
 from wheretolook.features.config import ExtractorConfig
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import Float, camera_centers, invert_poses, pose_error
 from wheretolook.holdout.photo_map import open_map
-from wheretolook.holdout.report import check_map
+from wheretolook.holdout.report import CheckReport, check_map
 from wheretolook.holdout.scores import Scoring
 from wheretolook.mapping.colmap_model import colmap_poses, holds_model
 from wheretolook.mapping.config import MIN_TRIANGULATION_ANGLE_DEG, FrameOptions, MapConfig, PhotographsConfig
@@ -51,11 +55,14 @@ from wheretolook.mapping.triangulation import (
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.processes import WorkerPool
 from wheretolook.utils.texts import quiet_colmap
+from wheretolook_paper.studies.tables import replace_rows
 
 FOCAL_PX = 525.0  # initial focal length of photographs with poses
 PARTNERS = 20  # that each photograph with a pose is matched with
 ROUNDS = 3  # of triangulation and bundle adjustment
 MAP = MapConfig()
+ACCURACIES_CSV = "photograph_accuracies.csv"
+ACCURACIES = (0.25, 2.0), (0.5, 5.0)  # metres and degrees, beside that of the weights
 
 
 def posed_model(camera: Any, names: list[str], poses: Mapping[int, Float], stored: list[Stored]) -> Any:
@@ -94,9 +101,9 @@ def map_known_poses(folder: Path, work: Path, extractor: ExtractorConfig, worker
     poses = invert_poses(np.stack([np.loadtxt(folder / f"{stem}.pose.txt")[:3] for stem in stems]))
     depth_m = np.stack([shrink_depth(read_depth(folder / f"{stem}.depth.png")) for stem in stems])
     with WorkerPool(workers) as processes:
-        config = MapConfig(extractor=extractor, photographs=PhotographsConfig(max_side_px=0))
+        config = PhotographsConfig(extractor=extractor)
         run = MapRun(config, processes)
-        features = photograph_features(work / "images", work / "photographs", run)
+        features = photograph_features(work / "images", work / "photographs", run, max_side_px=0)
         names = features.names
         stored = features.stored
         pinhole = PinholeCamera(int(features.sizes[0][0]), int(features.sizes[0][1]), FOCAL_PX)
@@ -151,6 +158,16 @@ def rows_of(scene: str, numbers: Mapping[str, Any], method: str) -> list[dict[st
     return rows
 
 
+def accuracy_row(result: CheckReport, other: CheckReport) -> dict[str, Any]:
+    """Return measures at another accuracy, and of the probabilities of `result` judged by the labels of this accuracy."""
+    good = other.views["good"].to_numpy(bool)
+    row = {"max_error_m": other.accuracy[0], "max_error_deg": other.accuracy[1], "views": len(good), "good": good.sum()}
+    for end, views in (("", other.views), ("_of_weights", result.views)):
+        row[f"auc{end}"] = roc_auc_score(good, views["score"])
+        row[f"ece{end}"] = expected_calibration_error(views["score"].to_numpy(), good)
+    return row
+
+
 def _ends(column: str, measured: Mapping[str, Any]) -> dict[str, Any]:
     ends = {"": "value", "_low": "low", "_high": "high"}
     return {column + end: measured.get(key) for end, key in ends.items()}
@@ -188,7 +205,7 @@ def main(
         if poses is not None:
             map_known_poses(poses, work, features, workers)
         else:
-            settings = MapConfig(photographs=PhotographsConfig(images=images), extractor=features)
+            settings = PhotographsConfig(images, extractor=features)
             map_photographs(settings, model, work / "photographs", workers=workers)
     scene = source.resolve().name
     photo_map = open_map(
@@ -200,12 +217,14 @@ def main(
     print("\n".join(result.lines()))
     rows = pd.DataFrame(rows_of(scene, result.numbers, result.method))
     print(rows.to_string(index=False, float_format="{:.3f}".format))
+    by_limits = pd.DataFrame([
+        {"scene": scene, **accuracy_row(result, check_map(photo_map, work / "check" / "work", at, workers=workers))}
+        for at in (replace(scoring, also=(), accuracy=accuracy) for accuracy in ACCURACIES)
+    ])  # fmt: skip
+    print(by_limits.to_string(index=False, float_format="{:.3f}".format))
     if out is not None:
-        others = pd.read_csv(out) if out.is_file() else pd.DataFrame({"scene": [], "method": []})
-        others = others[(others["scene"] != scene) | (others["method"] == "adapted")]
-        rows = pd.concat([others, rows], ignore_index=True)
-        out.parent.mkdir(parents=True, exist_ok=True)
-        rows.sort_values("scene", kind="stable").to_csv(out, index=False, float_format="%.4g")
+        replace_rows(out, rows, ["scene", "method"], "%.4g")
+        replace_rows(out.with_name(ACCURACIES_CSV), by_limits, ["scene", "max_error_m"], "%.4g")
 
 
 if __name__ == "__main__":

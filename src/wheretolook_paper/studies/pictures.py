@@ -1,15 +1,20 @@
-"""Regenerate pictures of the documentation from the release: figures of the catalog and pages of MLflow.
+"""Regenerate pictures of the documentation from the release: figures, and pages of MLflow and the viewer.
 
     python -m wheretolook_paper.studies.pictures
 
-The pages need Chromium; without it, they stay as they are.
+The pages need Chromium, the viewer's also the scene of the film (`wheretolook_paper.studies.results`); without these, they
+stay as they are.
 """
 
 from __future__ import annotations
 
+import base64
 import io
 import json
+import re
 import socket
+import subprocess
+import sys
 import time
 from contextlib import closing
 from dataclasses import dataclass
@@ -43,6 +48,12 @@ FIGURES = {
 }
 """Item of the catalog and width in pixels of each picture."""
 
+NOTEBOOK_FIGURES = {"docs/images/looks.webp": ("notebooks/10_looks.ipynb", "story_figure(shown")}
+"""Notebook, and text of the cell, whose output is the picture."""
+
+VIEWED = Path("data/film/apartment-210")
+VIEWER_STATE = "n=5;place=0.35,-1.52,1.45"
+
 TABLES = {
     "docs/images/mlflow-methods.webp": ("release: evaluation", "methods"),
     "docs/images/mlflow-top-n.webp": ("release: evaluation", "top-n"),
@@ -53,6 +64,7 @@ TABLES = {
 TABLE_SIZE = 1200, 620
 PLOT_SIZE = 1075, 575
 SCATTER_SIZE = 1075, 610
+VIEWER_SIZE = 1400, 960
 LOAD_S = 180  # until a page is complete
 LEFT, TOP = 206, 14
 """Where the pages of MLflow begin, right of its menu."""
@@ -83,7 +95,7 @@ PLOTS = {
         "release: learners",
         'params.learner != ""',
         ("average_precision_validation", "regret_others"),
-        ("learner", "learnt_from"),
+        ("learner", "trained_on"),
     ),
 }
 
@@ -109,8 +121,7 @@ def draw_figures(dataset: Dataset, tracking: TrackingConfig) -> None:
 def draw_pages(tracking: TrackingConfig, profile: Path) -> None:
     """Write `TABLES` and `PLOTS`, as MLflow shows them in a browser."""
     ids = {found.name: found.experiment_id for found in client(tracking).search_experiments()}
-    with socket.create_server((ADDRESS, 0)) as probe:
-        port = probe.getsockname()[1]
+    port = _free_port()
     server = f"http://{NAME}:{port}/"
     with serving(tracking, port), closing(Browser(profile, (LEFT + TABLE_SIZE[0] + TOP, 700))) as browser:
         for path, (experiment, view) in TABLES.items():
@@ -130,6 +141,45 @@ def draw_pages(tracking: TrackingConfig, profile: Path) -> None:
             else:
                 _choose_scatter(tab, plot)
                 _save(tab, path, SCATTER_SIZE)
+
+
+def draw_notebook_figures() -> None:
+    """Write `NOTEBOOK_FIGURES`."""
+    for path, (notebook, text) in NOTEBOOK_FIGURES.items():
+        cells = json.loads(Path(notebook).read_text(encoding="utf-8"))["cells"]
+        (cell,) = (cell for cell in cells if text in "".join(cell["source"]))
+        (output,) = cell["outputs"]
+        image = Image.open(io.BytesIO(base64.b64decode(output["data"]["image/png"])))
+        image.convert("RGB").save(path, quality=75, method=6)
+        print(path, flush=True)
+
+
+def draw_viewer(profile: Path) -> None:
+    """Write the picture of the viewer, once it has scored the floor and a location."""
+    if not VIEWED.is_dir():
+        print("the viewer: left as it is; first: python -m wheretolook_paper.studies.results --only '[film]'")
+        return
+    port = _free_port()
+    scene = ("--scene", VIEWED.name, "--name", VIEWED.parent.name)
+    command = [sys.executable, "-m", "wheretolook", "view", *scene, "--port", str(port), "--state", VIEWER_STATE]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as server:
+        try:
+            assert server.stdout is not None
+            next(line for line in server.stdout if line.startswith("http"))
+            with closing(Browser(profile, VIEWER_SIZE)) as browser:
+                tab = browser.open(f"http://localhost:{port}")
+                done = r"(\d+) of \1 locations[\s\S]* landmarks in view"
+                tab.wait(lambda tab: re.search(done, tab.text) is not None, 4 * LOAD_S)  # scores the floor
+                time.sleep(2)
+                tab.evaluate("document.querySelectorAll('.mantine-Notification-root').forEach(e => e.remove())")
+                tab.save(Path("docs/images/viewer.webp"), 0, 0, *VIEWER_SIZE)
+        finally:
+            server.terminate()
+
+
+def _free_port() -> int:
+    with socket.create_server((ADDRESS, 0)) as probe:
+        return int(probe.getsockname()[1])
 
 
 def _wait_for(tab: Tab, name: str, part: str) -> None:
@@ -175,9 +225,11 @@ def main(release: Path = Path("data/release")) -> None:
         tracking = TrackingConfig(f"{folder}/mlruns")
         log_release(dataset, tracking, attach=False)
         draw_figures(dataset, tracking)
+        draw_notebook_figures()
         if chromium() is None:
-            print("pages of MLflow: left as they are, there is no Chromium; install it: apt-get install chromium")
+            print("pages: left as they are, there is no Chromium; install it: apt-get install chromium")
         else:
+            draw_viewer(Path(folder, "viewer"))
             draw_pages(tracking, Path(folder, "browser"))
 
 

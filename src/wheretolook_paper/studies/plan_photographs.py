@@ -31,7 +31,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial.distance import pdist, squareform
 
-from wheretolook.dataset.environment import ColmapEnvironment, ColmapFiles, Environment
+from wheretolook.dataset.scene import ColmapFiles, Scene
 from wheretolook.figures.floor_plan import save_figure
 from wheretolook.geometry.camera import field_of_view_deg
 from wheretolook.geometry.poses import Float, camera_centers, poses_looking_along
@@ -52,6 +52,7 @@ from wheretolook_paper.figures.photograph_paths import (
     photograph_paths_figure,
     photograph_paths_markdown,
 )
+from wheretolook_paper.studies.tables import replace_rows
 
 GRID = (8, 8, 4)
 DIRECTIONS = 200
@@ -94,7 +95,7 @@ def localize_held_out(source: PhotographedMap, rows: NDArray[np.intp], work: Pat
 
 
 def plan_on(
-    scene: Environment, source: PhotographedMap, methods: tuple[str, ...], config: PlanConfig, work: Path, workers: int
+    scene: Scene, source: PhotographedMap, methods: tuple[str, ...], config: PlanConfig, work: Path, workers: int
 ) -> pd.DataFrame:
     """Plan between the ends in `config`, in the model's own frame, and return the table without the column `scene`."""
     assert config.start is not None and config.goal is not None
@@ -164,7 +165,7 @@ def main(
     """
     model, features = features_of(map, None, database, work, workers, device)
     source = open_map(model, features, name, frame)
-    scene = ColmapEnvironment(ColmapFiles(model, frame=frame), device=device)
+    scene = Scene.of_colmap(ColmapFiles(model, frame=frame), device=device)
     if ends is None:
         reach_m = 2 * scene.config.mapped_space.max_camera_distance_m
         rows = farthest_ends(scene.space, camera_centers(source.poses), reach_m)
@@ -181,20 +182,12 @@ def main(
     landmarks.insert(0, "scene", source.name)
     print(photograph_paths_markdown(table))
     if out is not None:
-        write_rows(table, out, 4)
-        write_rows(landmarks, out.with_name(LANDMARKS_CSV), 3)
+        replace_rows(out, table.round(4), ["scene"])
+        replace_rows(out.with_name(LANDMARKS_CSV), landmarks.round(3), ["scene"])
     if figure is not None:
         shown = table["image"].unique() if images is not None else ()
         pictures = {image: read_photograph(images / image)[::2, ::2] for image in shown}
         save_figure(photograph_paths_figure(table, landmarks, pictures), figure)
-
-
-def write_rows(rows: pd.DataFrame, path: Path, decimals: int) -> None:
-    """Write the rows of a scene to a CSV file, in place of those of the same scene that it has."""
-    others = pd.read_csv(path) if path.is_file() else rows[:0]
-    path.parent.mkdir(parents=True, exist_ok=True)
-    rows = pd.concat([others[~others["scene"].isin(rows["scene"])], rows]).sort_values("scene", kind="stable")
-    rows.round(decimals).to_csv(path, index=False)
 
 
 if __name__ == "__main__":

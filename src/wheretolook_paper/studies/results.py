@@ -1,12 +1,15 @@
 """Regenerate all results of the shipped weights: tables, the card, numbers of the pages, figures and notebooks. Resumes.
 
     python -m wheretolook_paper.studies.results --meshes MESHES --photographs PHOTOGRAPHS
-    python -m wheretolook_paper.studies.results --meshes MESHES --only interiors cameras
+    python -m wheretolook_paper.studies.results --meshes MESHES --only '[interiors, cameras]'
 
 `MESHES` holds the interiors by other authors that `data/release/results/generalization.md` names (GLB), `PHOTOGRAPHS` the
-folders kitchen and fox (docs/results.md). Neither is part of the project: without them, steps that need them are left out.
-`data/release/results/made.json` records for each step the weights, the device and the commands; a step whose record
-agrees is not repeated. Labels and maps of interrupted steps are reused.
+folders kitchen, fox and lund_door (docs/results.md). Neither is part of the project: without them, steps that need them
+are left out. `data/release/results/made.json` records for each step its commands, the device, and the weights and tables
+that it is computed from; a step whose record agrees is not repeated. Labels and maps of interrupted steps are reused.
+
+`variants.csv` is made with the weights, by `wheretolook train` and `wheretolook release`, the adapted rows of
+`photographs.csv` by `wheretolook adapt`: neither is a result of the shipped weights.
 """
 
 from __future__ import annotations
@@ -20,20 +23,25 @@ from pathlib import Path
 import pandas as pd
 from jsonargparse import auto_cli
 
+from wheretolook.dataset.config import ALL
 from wheretolook.evaluation.results import SCORES_CSV
 from wheretolook.utils.devices import usable_device
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.files import copy_file, read_json_object, sha256, write_json, write_text
 from wheretolook.utils.package import VERSION
 from wheretolook_paper.evaluation.looks import LOOKS_CSV
-from wheretolook_paper.paths.path_report import PATHS_CSV
-from wheretolook_paper.release.card import GENERALIZATION_CSV
+from wheretolook_paper.paths.path_report import PATHS_CSV, pooled_paths
+from wheretolook_paper.release.benchmark_runs import RUNTIMES_CSV
+from wheretolook_paper.release.card import GENERALIZATION_CSV, GENERALIZATION_MD
 from wheretolook_paper.release.numbers import Numbers, pages, updated
+from wheretolook_paper.studies.tables import replace_rows
 
 RELEASE = Path("data/release")
 RESULTS = RELEASE / "results"
 MADE = RESULTS / "made.json"
-WEIGHTS = [RELEASE / "weights" / f"{name}.safetensors" for name in ("set", "matchability", "mlp-2d+z")]
+SET, MATCHABILITY, NETWORK = (
+    RELEASE / "weights" / f"{name}.safetensors" for name in ("set", "matchability", "mlp-2d+z")
+)
 CAMERAS = {f"test-{angle}": ("--camera.fov_deg", str(angle)) for angle in (45, 60, 75, 90, 110)} | {
     "fisheye": ("--camera.model", "OPENCV_FISHEYE", "--camera.params", "[244.46, 244.46, 320, 240, 0, 0, 0, 0]")
 }
@@ -41,10 +49,6 @@ CAMERAS = {f"test-{angle}": ("--camera.fov_deg", str(angle)) for angle in (45, 6
 
 SCENES = ("aws_house", "nexuiz_aggressor", "nexuiz_aggressor_b", "nexuiz_desertfactory", "nexuiz_dieselpower",
           "nexuiz_dieselpower_b")  # fmt: skip
-FEW = ("--sample.max_locations", "60", "--sample.max_directions", "14")
-
-FILMED_PAIR = "1"
-"""Start and goal of the film: a path on which looking ahead fails on a part."""
 
 Words = Sequence[str]
 
@@ -54,86 +58,160 @@ class Step:
     """A part of the results.
 
     Attributes:
-        commands: arguments of `python -m`, run one after the other.
+        commands: arguments of `python -m`, or of `python` for a script, run one after the other.
+        inputs: weights, and tables of other steps, that the commands read.
         collect: writes the release's tables from what the commands wrote.
         needs: folder that the user must give: "meshes", "photographs" or none.
     """
 
     commands: Sequence[Words]
+    inputs: Sequence[Path] = ()
     collect: Callable[[], None] = lambda: None
     needs: str = ""
 
+    def record(self) -> dict[str, object]:
+        """Return what decides the step's results."""
+        inputs = {path.name: sha256(path)[:16] for path in self.inputs if path.is_file()}
+        return {"inputs": inputs, "commands": [" ".join(words) for words in self.commands]}
 
-def steps(meshes: Path = Path("MESHES"), photographs: Path = Path("PHOTOGRAPHS")) -> dict[str, Step]:
+
+def steps(
+    meshes: Path = Path("MESHES"), photographs: Path = Path("PHOTOGRAPHS"), device: str = "DEVICE"
+) -> dict[str, Step]:
     """Return all steps by name, in an order in which each finds the tables of those before it."""
     scenes = ", ".join(f"{{path: {meshes / name}.glb, split: test}}" for name in SCENES)
     others = ("--scenes.meshes", f"[{scenes}]")
-    bundled = ("--evaluate.weights", f"[{', '.join(map(str, WEIGHTS))}]")
 
-    def demo(name: str, *options: str) -> tuple[str, ...]:
-        return ("wheretolook", "demo", "--config", "configs/others.yaml", "--name", name, *others, *options)
+    def run(command: str, name: str, *options: str, config: str = "others") -> Words:
+        named = ("--name", name) if name else ()
+        return ("wheretolook", command, "--config", f"configs/{config}.yaml", *named, *options, "--device", device)
 
-    def on_looks(command: str, *options: str) -> tuple[str, ...]:
-        return ("wheretolook", command, "--config", "configs/others.yaml", "--name", "looks", *options)
+    def mapped(name: str, *options: str) -> list[Words]:
+        return [run("scenes", name, *options, *others), run("map", name, *options, "--mapping.camera", "{fov_deg: 90}")]
 
     def labelled(name: str, *options: str, sample: Words = (), label: Words = ()) -> list[Words]:
-        words = ("--config", "configs/others.yaml", "--name", name, *options)
-        stages = {"scenes": others, "map": ("--mapping.camera", "{fov_deg: 90}"), "sample": sample, "label": label}
-        return [("wheretolook", stage, *words, *of_stage) for stage, of_stage in stages.items()]
+        return [*mapped(name, *options), run("sample", name, *options, *sample), run("label", name, *options, *label)]
 
-    views = {name: labelled(name, *camera, sample=FEW if name == "fisheye" else ()) for name, camera in CAMERAS.items()}
+    def study(name: str, *options: str) -> Words:
+        return (f"wheretolook_paper.studies.{name}", *options)
+
+    def checked(name: str, kind: str, folder: str, *options: str) -> Words:
+        return study("photographs", kind, str(photographs / folder), "--work", f"data/photographs/{name}", *options)
+
+    def planned(name: str, images: str, *frame: str) -> Words:
+        work = f"data/photographs/{name}"
+        shown = ("--images", str(photographs / images), "--device", device)
+        out = ("--out", str(RESULTS / "plan_photographs.csv"))
+        return study(
+            "plan_photographs", "--map", f"{work}/map", "--work", f"{work}/check", "--name", name, *frame, *shown, *out
+        )
+
+    bundled = f"[{SET}, {MATCHABILITY}, {NETWORK}]"
+    few = ("--sample.max_locations", "60", "--sample.max_directions", "14")
+    views = [
+        words
+        for name, camera in CAMERAS.items()
+        for words in labelled(name, *camera, sample=few if name == "fisheye" else ())
+    ]
     tested = ("--datasets", f"[{', '.join(f'data/{name}' for name in CAMERAS)}]", "--split", "test")
-    cameras = ("wheretolook_paper.studies.cameras", *tested, "--out", str(RESULTS / "cameras.csv"))
-    looks = labelled("looks", sample=("--sample.max_locations", "30", "--sample.max_directions", "50"),
-                     label=("--label.store_pixels", "true"))  # fmt: skip
-    ranked = on_looks("evaluate", "--evaluate.weights", f"[{WEIGHTS[0]}]", "--evaluate.methods", "[set, visible]")
-    study = "wheretolook_paper.studies.photographs"
-    film = ("--config", "configs/others.yaml", "--name", "film", "--scenes.test", "1")
+    many = ("--sample.max_locations", "30", "--sample.max_directions", "50")
+    looks = labelled("looks", sample=many, label=("--label.store_pixels", "true"))
+    tabled = ("--out", str(RESULTS / "photographs.csv"))
+    metric = ("--frame.scale", "1", "--frame.up", "0.0089,-0.9044,-0.4265")
+    benchmark = "tests/benchmarks/bench_"
+    measured = [f"data/runtimes/{name}.json" for name in ("visibility", "step")]
+    film = ("--scenes.test", "1")
     compared = ("--paths.methods", "[forward, set]", "--paths.pairs", "8")
-    shown = ("--scene", "apartment-210", "--name", "film", "--path", "data/film/results/paths/apartment-210")
-    photographed = ("--out", str(RESULTS / "photographs.csv"))
+    # the pair: a path on which looking ahead fails on a part
+    shown = ("--scene", "apartment-210", "--path", "data/film/results/paths/apartment-210", "--pair", "1")
     return {
-        "interiors": Step([demo("interiors", "--scenes.test", "0", *bundled)], _generalization, "meshes"),
-        **{name: Step(commands, needs="meshes") for name, commands in views.items()},
-        "cameras": Step([cameras], needs="meshes"),
-        "looks": Step([*looks, ranked], _looks, "meshes"),
-        "relocalize": Step([on_looks("relocalize")], lambda: _copy("looks", "relocalize.csv"), "meshes"),
-        "paths": Step(
-            [("wheretolook", "compare-paths", "--config", "configs/others.yaml", "--name", "test-90")],
-            lambda: _copy("test-90", PATHS_CSV),
+        "interiors": Step(
+            [run("demo", "interiors", *others, "--scenes.test", "0", "--evaluate.weights", bundled)],
+            (SET, MATCHABILITY, NETWORK),
+            _generalization,
             "meshes",
         ),
-        "kitchen": Step(
-            [(study, "--poses", str(photographs / "kitchen"), "--work", "data/photographs/kitchen", *photographed)],
+        "cameras": Step(
+            [*views, study("cameras", *tested, "--out", str(RESULTS / "cameras.csv"))],
+            (SET, MATCHABILITY),
+            needs="meshes",
+        ),
+        "looks": Step(
+            [*looks, run("evaluate", "looks", "--evaluate.weights", f"[{SET}]", "--evaluate.methods", "[set, visible]")],
+            (SET,),
+            _looks,
+            "meshes",
+        ),
+        "relocalize": Step(
+            [*looks[:3], run("relocalize", "looks")], (SET,), lambda: _copy("looks/results/relocalize.csv"), "meshes"
+        ),
+        **{
+            f"paths-{scene}": Step(
+                [*mapped("test-90"), run("compare-paths", "test-90", "--paths.scenes", f"[{scene}]")],
+                (SET,),
+                _paths,
+                "meshes",
+            )
+            for scene in ("apartment-210", "apartment-211", *SCENES)
+        },
+        "kitchen": Step([checked("kitchen", "--poses", "kitchen", *tabled)], (SET, MATCHABILITY), needs="photographs"),
+        "fox": Step([checked("fox", "--images", "fox", *tabled)], (SET, MATCHABILITY), needs="photographs"),
+        "plan-kitchen": Step(
+            [checked("kitchen", "--poses", "kitchen"), planned("kitchen", "kitchen", *metric)],
+            (SET,),
             needs="photographs",
         ),
-        "fox": Step(
-            [(study, "--images", str(photographs / "fox"), "--work", "data/photographs/fox", *photographed)],
+        "plan-lund_door": Step(
+            [checked("lund_door", "--images", "lund_door/images"), planned("lund_door", "lund_door/images")],
+            (SET,),
             needs="photographs",
         ),
-        "release": Step([("wheretolook", "release", "--config", "configs/release.yaml")]),
+        "runtimes": Step(
+            [
+                (f"{benchmark}visibility.py", "--out", measured[0], "--device", device),
+                (f"{benchmark}scorers.py", "--step", *("--landmarks", "24919", "--locations", "50", "--poses", "50"),
+                 "--out", measured[1], "--device", device),
+                (f"{benchmark}visibility.py", "--draw", str(RESULTS / RUNTIMES_CSV), *measured,
+                 "--figures", "data/runtimes"),
+            ],
+            (SET, NETWORK),
+            lambda: _copy(f"runtimes/{RUNTIMES_CSV}"),
+        ),
+        "hloc": Step(
+            [
+                study("compare_hloc", "compare", "--sets", "[building-700]", "--locations", "20",
+                      "--work", "data/hloc", "--out", str(RESULTS / "hloc.csv"), "--device", device)
+            ],
+            (SET,),
+        ),
+        "release": Step(
+            [run("release", "", config="release")],
+            (SET, MATCHABILITY, NETWORK, RESULTS / GENERALIZATION_CSV, RESULTS / GENERALIZATION_MD),
+        ),
         "film": Step(
             [
-                *(("wheretolook", stage, *film) for stage in ("scenes", "map")),
-                ("wheretolook", "compare-paths", *film, *compared),
-                ("wheretolook", "view", *shown, "--pair", FILMED_PAIR, "--film", "docs/images/lost.webp"),
-            ]
+                *(run(stage, "film", *film) for stage in ("scenes", "map", "sample")),
+                run("compare-paths", "film", *film, *compared),
+                ("wheretolook", "view", "--name", "film", *shown, "--film", "docs/images/lost.webp", "--device", device),
+                run("relocalize", "film", *film, "--policies", "[even, gain]", "--film", "docs/images/relocalize.webp"),
+            ],
+            (SET,),
         ),
-        "pictures": Step([("wheretolook_paper.studies.pictures",)]),
-        "pages": Step([], _pages),
-        "notebooks": Step([], _notebooks),
-    }
+        "notebooks": Step([("notebooks/execute.py",)], sorted(RESULTS.glob("*.csv"))),
+        "pictures": Step([study("pictures")], sorted(RESULTS.glob("*.csv"))),
+        "pages": Step([], collect=_pages),
+    }  # fmt: skip
 
 
-def _copy(dataset: str, name: str) -> None:
-    copy_file(Path("data") / dataset / "results" / name, RESULTS / name)
+def _copy(path: str) -> None:
+    copy_file(Path("data", path), RESULTS / Path(path).name)
 
 
 def _generalization() -> None:
     """Write the scores on the interiors with the weights that they are of."""
     table = pd.read_csv(Path("data/interiors/results") / SCORES_CSV)
     table.insert(0, "dataset", "interiors")
-    table["weights_sha256"] = sha256(WEIGHTS[0])
+    table["weights_sha256"] = sha256(SET)
     write_text(RESULTS / GENERALIZATION_CSV, table.to_csv(index=False, float_format="%.5g", lineterminator="\n"))
 
 
@@ -141,9 +219,15 @@ def _looks() -> None:
     """Replace the rows of the test split."""
     table = pd.read_csv(Path("data/looks/results") / LOOKS_CSV)
     table.insert(0, "split", "test")
-    before = pd.read_csv(RESULTS / LOOKS_CSV)
-    table = pd.concat([before[before["split"] != "test"], table], ignore_index=True)
-    write_text(RESULTS / LOOKS_CSV, table.to_csv(index=False, float_format="%.4g", lineterminator="\n"))
+    replace_rows(RESULTS / LOOKS_CSV, table, ["split"], "%.4g")
+
+
+def _paths() -> None:
+    """Replace the rows of a scene, and combine those of all scenes."""
+    table = replace_rows(RESULTS / PATHS_CSV, pd.read_csv(Path("data/test-90/results") / PATHS_CSV), ["scene"], "%.6g")
+    of_scenes = table[table["scene"] != ALL]
+    table = pd.concat([of_scenes, pooled_paths(of_scenes)], ignore_index=True)
+    write_text(RESULTS / PATHS_CSV, table.to_csv(index=False, float_format="%.6g", lineterminator="\n"))
 
 
 def _pages() -> None:
@@ -153,28 +237,14 @@ def _pages() -> None:
         write_text(Path(page), updated(page, numbers))
 
 
-def _notebooks() -> None:
-    """Execute the notebooks of the checkout and store their outputs."""
-    subprocess.run([sys.executable, "notebooks/execute.py"], check=True)
-
-
 def outdated(only: Sequence[str] = ()) -> Iterator[str]:
-    """Yield the steps whose tables are not of the shipped weights or of other commands."""
-    made = read_json_object(MADE) if MADE.is_file() else {}
-    for name, step in steps().items():
-        record = made.get(name, {})
-        if not only and step.commands and (record.get("weights"), record.get("commands")) == (_weights(), _texts(step)):
-            continue
-        if not only or name in only:
+    """Yield the steps whose record is of other weights, tables or commands; with `only`, these."""
+    for name in steps():
+        made = read_json_object(MADE) if MADE.is_file() else {}
+        step = steps()[name]  # with the tables of the steps before it
+        is_current = bool(step.commands) and step.record().items() <= made.get(name, {}).items()
+        if name in only or (not only and not is_current):
             yield name
-
-
-def _weights() -> str:
-    return sha256(WEIGHTS[0])[:16]
-
-
-def _texts(step: Step) -> list[str]:
-    return [" ".join(words) for words in step.commands]
 
 
 def main(
@@ -184,29 +254,28 @@ def main(
 
     Args:
         meshes: folder of the interiors by other authors.
-        photographs: folder of the folders kitchen and fox.
+        photographs: folder of the folders kitchen, fox and lund_door.
         only: names of steps, also current ones are then repeated.
         device: where to compute: auto, cpu, cuda, or cuda:<index>.
     """
     if unknown := {*only} - {*steps()}:
         raise ConfigError("unknown step", value=sorted(unknown), fix=f"Steps: {', '.join(steps())}.")
     given = {"": Path(), "meshes": meshes, "photographs": photographs}
+    device = usable_device(device)
     for name in outdated(only):
-        named = steps()[name]
-        if given[named.needs] is None:
-            print(f"{name}: left out, needs --{named.needs}")
+        step = steps(meshes or Path(), photographs or Path(), device)[name]
+        if given[step.needs] is None:
+            print(f"{name}: left out, needs --{step.needs}")
             continue
-        step = steps(meshes or Path(), photographs or Path())[name]
         for words in step.commands:
-            chosen = ["--device", device] if words[0] == "wheretolook" else []
             print(f"{name}: {' '.join(words)}", flush=True)
-            subprocess.run([sys.executable, "-m", *words, *chosen], check=True)
+            module = () if words[0].endswith(".py") else ("-m",)
+            subprocess.run([sys.executable, *module, *words], check=True)
         step.collect()
-        if not step.commands:
-            continue
-        made = read_json_object(MADE) if MADE.is_file() else {}
-        record = {"weights": _weights(), "version": VERSION, "device": usable_device(device), "commands": _texts(named)}
-        write_json(MADE, made | {name: record})
+        if step.commands:
+            made = read_json_object(MADE) if MADE.is_file() else {}
+            record = {"version": VERSION, "device": device, **steps()[name].record()}
+            write_json(MADE, made | {name: record})
 
 
 if __name__ == "__main__":

@@ -15,7 +15,8 @@ from wheretolook.mapping.config import FrameOptions
 from wheretolook.space.free_space import MappedSpace
 from wheretolook.utils.errors import PlanningError
 from wheretolook_paper.figures.photograph_paths import AXIS, LANDMARKS_CSV, PATHS_CSV, POSITION
-from wheretolook_paper.studies.plan_photographs import farthest_ends, main, nearest_photographs, write_rows
+from wheretolook_paper.studies.plan_photographs import farthest_ends, main, nearest_photographs
+from wheretolook_paper.studies.tables import replace_rows
 
 
 def test_the_nearest_photograph_weighs_the_angle_against_the_distance_in_depths() -> None:
@@ -43,7 +44,7 @@ def test_ends_are_the_farthest_photographs_that_free_space_connects() -> None:
 def test_rows_of_other_scenes_are_kept(tmp_path: Path) -> None:
     file = tmp_path / "table.csv"
     for scene, value in (("b", 1), ("a", 2), ("b", 3)):
-        write_rows(pd.DataFrame({"scene": [scene], "value": [value]}), file, 2)
+        replace_rows(file, pd.DataFrame({"scene": [scene], "value": [value]}), ["scene"])
     assert pd.read_csv(file).to_numpy().tolist() == [["a", 2], ["b", 3]]
 
 

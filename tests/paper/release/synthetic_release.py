@@ -89,7 +89,7 @@ def runtimes() -> pd.DataFrame:
 
 def learners() -> pd.DataFrame:
     rows = [
-        {"learner": learner, "learnt_from": source, "seed": seed, "split": split, "scene": scene,
+        {"learner": learner, "trained_on": source, "seed": seed, "split": split, "scene": scene,
          "average_precision": 0.8 + seed / 10, "roc_auc": 0.9, "ece": 0.1, "regret": regret}
         for learner, source, seed in (("bins", "", 0), ("set", "apartments", 0), ("set", "apartments", 1))
         for split, scene, regret in (("test", "a", 0.1), ("test", "b", 0.3), ("others", "c", 0.2))

@@ -13,6 +13,7 @@ import pandas as pd
 import pytest
 
 from all_options import AllOptions, run
+from fixed_fields import with_fields
 from learning_options import changed, train_config
 from synthetic_dataset import CAMERA, make_dataset
 from wheretolook.cli import parse_command
@@ -245,11 +246,11 @@ def test_the_shipped_weights_score_as_the_card_says(shipped: Dataset, tmp_path: 
     shutil.copytree(shipped.root, tmp_path / "data" / "release")
     experiment = parse_command(
         "evaluate", ["--config", str(CONFIGS / "release.yaml"), "--data", str(tmp_path / "data"), "--device", "cpu",
-                     "--tracking.folder", str(tmp_path / "mlruns"), "--evaluate.resamples", "2",
+                     "--tracking.folder", str(tmp_path / "mlruns"),
                      "--evaluate.methods", "[random,visible,bins,fisher-logdet-exact,mlp]",
                      "--evaluate.occlusions", "[]"]
     )  # fmt: skip
-    assert experiment is not None
+    experiment = with_fields(experiment, {"evaluate.resamples": 2})
     scores = run(Evaluate, experiment, log=quiet)
     said = pd.read_csv(shipped.root / "results" / "scores.csv")
     said = said[said["occlusion"] == "mesh"].merge(scores[["method"]].drop_duplicates()).reset_index(drop=True)

@@ -12,6 +12,7 @@ from wheretolook.geometry.lattices import fibonacci_sphere
 from wheretolook.geometry.poses import Float, camera_centers, poses_looking_along
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.landmarks import Landmarks
+from wheretolook.mapping.map import Map
 from wheretolook.visibility.frustum import LandmarkSets, PosedViews
 from wheretolook.visibility.occlusion import StoredOcclusion
 from wheretolook_paper.fisher.exact import exact_information_plain
@@ -43,7 +44,7 @@ def views_at(locations: Float, directions: Float = DIRECTIONS) -> Float:
 @pytest.mark.parametrize("approximation", APPROXIMATIONS)
 def test_of_a_room_with_landmarks_on_two_walls_it_looks_at_them(metric: str, approximation: Approximation) -> None:
     rng = np.random.default_rng(1)
-    localization_map = LocalizationMap(two_walls(rng), CAMERA)
+    localization_map = LocalizationMap(Map(two_walls(rng)), CAMERA)
     hits = 0
     for location in rng.uniform((-3, -3, 0.8), (2, 2, 1.8), (20, 3)):
         scores = FisherScorer(localization_map, metric, approximation).score(views_at(location[None]))
@@ -73,7 +74,7 @@ def test_exact_scores_are_numpys_of_the_sums(about_origin: bool) -> None:
         "logdet": np.sign(determinant) * np.log1p(np.abs(determinant)),
         "mineig": np.linalg.svd(matrices, compute_uv=False)[:, -1],
     }
-    seen = LocalizationMap(landmarks, CAMERA, StoredOcclusion.from_mask(locations, mask))
+    seen = LocalizationMap(Map(landmarks), CAMERA, StoredOcclusion.from_mask(locations, mask))
     for metric, values in expected.items():
         scores = FisherScorer(seen, metric, "exact", about_origin).score(poses)
         np.testing.assert_allclose(scores, values, rtol=1e-6, atol=1e-6)
@@ -82,7 +83,7 @@ def test_exact_scores_are_numpys_of_the_sums(about_origin: bool) -> None:
 
 def test_probes_look_away_from_the_landmarks() -> None:
     rng = np.random.default_rng(5)
-    localization_map = LocalizationMap(two_walls(rng), CAMERA)
+    localization_map = LocalizationMap(Map(two_walls(rng)), CAMERA)
     locations = rng.uniform((-3, -3, 0.8), (2, 2, 1.8), (5, 3))
     poses = views_at(locations)
     for scorer in (WorstTraceScorer(localization_map), StationaryTraceScorer(localization_map)):

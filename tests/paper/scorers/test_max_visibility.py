@@ -10,6 +10,7 @@ from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.lattices import axes_of_angles, fibonacci_sphere, yaw_pitch_angles
 from wheretolook.geometry.poses import Float, poses_looking_along
 from wheretolook.inputs.localization_map import LocalizationMap
+from wheretolook.mapping.map import Map
 from wheretolook_paper.scorers.max_visibility import MaxVisibilityScorer, SwappedMaxVisibilityScorer
 
 CAMERA = PinholeCamera(320, 320, 277.0)
@@ -17,7 +18,7 @@ CAMERA = PinholeCamera(320, 320, 277.0)
 
 @pytest.fixture
 def localization_map() -> LocalizationMap:
-    return LocalizationMap(make_landmarks(np.random.default_rng(0), 400), CAMERA)
+    return LocalizationMap(Map(make_landmarks(np.random.default_rng(0), 400)), CAMERA)
 
 
 def count_of_the_benchmark(pose: Float, points: Float) -> int:
@@ -36,7 +37,7 @@ def test_max_visibility_counts_as_the_benchmark(localization_map: LocalizationMa
     points = localization_map.landmarks.points
     poses = poses_looking_along(rng.uniform((-2, -2, 0.5), (2, 2, 2), (60, 3)), rng.normal(size=(60, 3)))
     expected = [count_of_the_benchmark(pose, points) for pose in poses]
-    scorer = MaxVisibilityScorer(LocalizationMap(localization_map.landmarks, CAMERA, device=device))
+    scorer = MaxVisibilityScorer(LocalizationMap(Map(localization_map.landmarks), CAMERA, device=device))
     np.testing.assert_allclose(scorer.score(poses) * len(points), expected, atol=1e-9)
     assert max(expected) > 50 and min(expected) == 0
     behind_3_m = [np.sum((points @ pose[2, :3] + pose[2, 3]) >= 3) for pose in poses]

@@ -12,6 +12,7 @@ from synthetic_dataset import CAMERA, make_landmarks, make_mapping_poses
 from wheretolook.geometry.lattices import axes_of_angles, fibonacci_sphere, yaw_pitch_angles
 from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.inputs.localization_map import LocalizationMap
+from wheretolook.mapping.map import Map
 from wheretolook.training.trained_network import TrainedNetwork
 from wheretolook.visibility.occlusion import StoredOcclusion
 from wheretolook_paper.scorers.sphere import SphereConfig
@@ -25,7 +26,7 @@ FEW = SphereConfig(points=48, cameras=8, width=32, heads=2, layers=1, dropout=0.
 @pytest.fixture
 def localization_map() -> LocalizationMap:
     landmarks = make_landmarks(np.random.default_rng(0), 200)
-    return LocalizationMap(landmarks, CAMERA, mapping_poses=make_mapping_poses(0))
+    return LocalizationMap(Map(landmarks, mapping_poses=make_mapping_poses(0)), CAMERA)
 
 
 @pytest.fixture

@@ -84,9 +84,8 @@ def adapted_scorer(localization_map: LocalizationMap, options: BuildOptions) -> 
     share = share_of_place(trained.network.place.numpy(), localization_map.landmarks.points)
     if share < MIN_SHARE and not options.anywhere:
         fix = (
-            "Adapt to this map, or use weights for any scene, such as the bundled ones. To use them anyway: --anywhere "
-            "(select, check), --viewpoint_map.anywhere true, --plan.anywhere true, --evaluate.anywhere true, in Python "
-            "anywhere=True."
+            "Adapt to this map, or use weights for any scene, such as the bundled ones. To use them anyway: --anywhere, "
+            "--evaluate.anywhere true, in Python anywhere=True."
         )
         problem = f"these weights are adapted to another scene: this map has {share:.0%} of its landmarks"
         raise WeightsError(problem, fix=fix)
@@ -103,7 +102,8 @@ class AdaptedScorer(Scorer):
         network = trained.network
         self.trained = trained
         of_base = network.network, trained.camera, network.base_scale, network.base_offset, trained.training_range
-        known = replace(localization_map, photographs=False)  # the base is calibrated for this map already
+        rendered = replace(localization_map.map, has_photographs=False)
+        known = replace(localization_map, map=rendered)  # the base is calibrated for this map already
         self.base = SetScorer(known, TrainedNetwork("set", *of_base))
 
     def score(self, cam_from_world: Float) -> Float:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from wheretolook.inputs.channels import ALL_CHANNELS, PAPER_VARIANTS, Layout
 from wheretolook.scorers.registry import Learner, Method, imported, network_scorer
 from wheretolook.training.config import FittingConfig, Keep, Schedule, check_choice, check_range
-from wheretolook.utils.errors import ConfigError
+from wheretolook.utils.errors import ConfigError, no_option
 
 if TYPE_CHECKING:
     from wheretolook.training.learner import TrainingJob, TrainingResult
@@ -63,18 +63,18 @@ class MlpConfig(FittingConfig):
     epochs: int = 300
     batch_size: int = 128
     learning_rate: float = 1e-3
-    l2: float = 3e-3
-    schedule: Schedule = "constant"
-    dropout: float = 0.5
-    input_dropout: float = 0.0
-    hidden: tuple[int, ...] = (300, 300)
-    bins: int = 30
+    l2: float = no_option(3e-3)
+    schedule: Schedule = no_option("constant")
+    dropout: float = no_option(0.5)
+    input_dropout: float = no_option(0.0)
+    hidden: tuple[int, ...] = no_option((300, 300))
+    bins: int = no_option(30)
     layout: Layout = "in_place"
     noise_px: float = 0.0
     noise_m: float = 0.0
     balance: bool = False
-    keep: Keep = "best"
-    patience: int | None = None
+    keep: Keep = no_option("best")
+    patience: int | None = no_option(None)
 
     def __post_init__(self) -> None:
         super().__post_init__()

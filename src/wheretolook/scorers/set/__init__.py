@@ -8,7 +8,7 @@ from math import inf
 from wheretolook.inputs.channels import ATTRIBUTES, OF_SIZE
 from wheretolook.scorers.registry import Learner, Method, imported, network_scorer
 from wheretolook.training.config import FittingConfig, check_range
-from wheretolook.utils.errors import ConfigError
+from wheretolook.utils.errors import ConfigError, no_option
 
 
 @dataclass(frozen=True)
@@ -23,10 +23,10 @@ class LandmarksConfig(FittingConfig):
         enlarged: maximum factor by which scenes are scaled up or down in training; 1 does not scale them.
     """
 
-    landmarks: int = 64
-    width: int = 48
-    hidden: tuple[str, ...] = OF_SIZE
-    enlarged: float = 3.0
+    landmarks: int = no_option(64)
+    width: int = no_option(48)
+    hidden: tuple[str, ...] = no_option(OF_SIZE)
+    enlarged: float = no_option(3.0)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -42,8 +42,8 @@ class LandmarksConfig(FittingConfig):
 class MatchabilityConfig(LandmarksConfig):
     """Options of the probability that a visible landmark is detected."""
 
-    epochs: int = 6
-    batch_size: int = 256
+    epochs: int = no_option(6)
+    batch_size: int = no_option(256)
 
 
 @dataclass(frozen=True)
@@ -63,12 +63,12 @@ class SetConfig(LandmarksConfig):
     epochs: int = 8
     batch_size: int = 1024
     learning_rate: float = 3e-3
-    landmarks: int = 192
-    landmark_loss: float = 0.5
-    pooled: int = 0
-    head: int = 48
-    dropout: float = 0.1
-    from_matchability: bool = True
+    landmarks: int = no_option(192)
+    landmark_loss: float = no_option(0.5)
+    pooled: int = no_option(0)
+    head: int = no_option(48)
+    dropout: float = no_option(0.1)
+    from_matchability: bool = no_option(True)
 
     def __post_init__(self) -> None:
         super().__post_init__()

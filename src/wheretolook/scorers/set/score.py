@@ -25,6 +25,7 @@ from wheretolook.inputs.landmark_features import LandmarkDescriber, ViewLandmark
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.colmap_model import observation_matrix, select_points
 from wheretolook.mapping.landmarks import MAP_ATTRIBUTES
+from wheretolook.mapping.map import Map
 from wheretolook.scorers.base import LandmarkProbabilities, Scorer
 from wheretolook.scorers.set.accuracy import AccuracyModel, probabilities, statistics_of
 from wheretolook.scorers.set.network import N_EXPECTED, SetNetwork, bearing_precision, expected_cells
@@ -323,7 +324,7 @@ def for_map(trained: TrainedNetwork[SetNetwork], localization_map: LocalizationM
 
     The log-odds of detection get `detection_offset`, those of the view `TrainedNetwork.photograph_offset`.
     """
-    if not localization_map.photographs:
+    if not localization_map.map.has_photographs:
         return trained
     network = deepcopy(trained.network)
     last = network.matchability.layers[-1]
@@ -335,9 +336,10 @@ def for_map(trained: TrainedNetwork[SetNetwork], localization_map: LocalizationM
 
 def _known_offset(network: SetNetwork, localization_map: LocalizationMap) -> float:
     """Return `detection_offset`, estimated once for all cameras and parts of a map."""
-    if localization_map.images is None:
+    whole = localization_map.map.whole or localization_map.map
+    if whole.images is None:
         return 0.0
-    known = localization_map.images.offsets
+    known = whole.computed
     occlusion = localization_map.occlusion
     if isinstance(occlusion, CachedOcclusion):
         occlusion = occlusion.model
@@ -356,28 +358,30 @@ def detection_offset(network: SetNetwork, localization_map: LocalizationMap) -> 
     remaining landmarks as there are observations of them in the held-out images. 0 if the images are unknown, fewer
     than `MIN_IMAGES`, or observe hardly any of these landmarks. Measured in docs/research/cameras.md.
     """
-    images = localization_map.images
-    if images is None or len(images) < MIN_IMAGES:
+    whole = localization_map.map.whole or localization_map.map
+    images = whole.images
+    if images is None or len(images.image_ids) < MIN_IMAGES:
         return 0.0
-    kept = np.zeros(len(images.arrays.points), dtype=bool)
+    kept = np.zeros(len(images.points), dtype=bool)
     kept[:: max(1, -(-len(kept) // MAX_POINTS))] = True
-    images = replace(images, arrays=select_points(images.arrays, kept))
-    observes = observation_matrix(images.arrays)
+    images = select_points(images, kept)
+    observes = observation_matrix(images)
     n_observed = 0.0
     parts: list[tuple[torch.Tensor, torch.Tensor]] = []
     seeing = np.flatnonzero(np.asarray(observes.sum(1)).reshape(-1))
     for first in seeing[_spread(len(seeing), BLOCKS)]:
         common = (observes @ observes[[first]].T).toarray().reshape(-1)
-        block = np.argsort(-common, kind="stable")[: max(1, round(len(images) * SHARE))]
+        block = np.argsort(-common, kind="stable")[: max(1, round(len(images.image_ids) * SHARE))]
         block = block[common[block] > 0]
-        remaining = images.without(block)
+        remaining = whole.without(images, block)
         if len(remaining) == 0:
             continue
-        describer = LandmarkDescriber(replace(localization_map, landmarks=remaining), network.attributes)
+        describer = LandmarkDescriber(replace(localization_map, map=Map(remaining)), network.attributes)
         tested = block[_spread(len(block), TESTED)]
-        n_observed += observes[tested][:, np.isin(images.arrays.point_ids, remaining.ids)].sum()
+        n_observed += observes[tested][:, np.isin(images.point_ids, remaining.ids)].sum()
         for row in tested:
-            views = describer.of_camera(images.cameras[row]).in_blocks(images.poses[[row]], OFFSET_LANDMARKS)
+            camera = whole.cameras[int(images.image_cameras[row])]
+            views = describer.of_camera(camera).in_blocks(images.image_poses[[row]], OFFSET_LANDMARKS)
             for _, described, n_visible in views:
                 with torch.inference_mode():
                     log_odds = network.matchability(described.values).double()

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from wheretolook.scorers.registry import Learner, Method, imported, network_scorer
 from wheretolook.training.config import FittingConfig, check_range
-from wheretolook.utils.errors import ConfigError
+from wheretolook.utils.errors import ConfigError, no_option
 
 
 @dataclass(frozen=True)
@@ -19,9 +19,9 @@ class ConvConfig(FittingConfig):
         bins: bins along each side of the image.
     """
 
-    widths: tuple[int, ...] = (32, 64, 128, 128)
-    dropout: float = 0.2
-    bins: int = 30
+    widths: tuple[int, ...] = no_option((32, 64, 128, 128))
+    dropout: float = no_option(0.2)
+    bins: int = no_option(30)
 
     def __post_init__(self) -> None:
         super().__post_init__()

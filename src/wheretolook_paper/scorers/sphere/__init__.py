@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from wheretolook.scorers.registry import Learner, Method, imported, network_scorer
 from wheretolook.training.config import FittingConfig, check_range
-from wheretolook.utils.errors import ConfigError
+from wheretolook.utils.errors import ConfigError, no_option
 
 
 @dataclass(frozen=True)
@@ -22,15 +22,15 @@ class SphereConfig(FittingConfig):
         dropout: share of values dropped in the blocks of attention.
     """
 
-    epochs: int = 30
-    batch_size: int = 1024
-    learning_rate: float = 5e-4
-    points: int = 512
-    cameras: int = 128
-    width: int = 96
-    heads: int = 4
-    layers: int = 2
-    dropout: float = 0.1
+    epochs: int = no_option(30)
+    batch_size: int = no_option(1024)
+    learning_rate: float = no_option(5e-4)
+    points: int = no_option(512)
+    cameras: int = no_option(128)
+    width: int = no_option(96)
+    heads: int = no_option(4)
+    layers: int = no_option(2)
+    dropout: float = no_option(0.1)
 
     def __post_init__(self) -> None:
         super().__post_init__()

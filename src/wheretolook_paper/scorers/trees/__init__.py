@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from wheretolook.scorers.registry import BuildOptions, Learner, Method, imported
-from wheretolook.utils.errors import check_positive, check_range
+from wheretolook.utils.errors import check_positive, check_range, no_option
 
 if TYPE_CHECKING:
     from wheretolook.inputs.localization_map import LocalizationMap
@@ -25,11 +25,11 @@ class TreesConfig:
         l2: penalty on the leaves' values.
     """
 
-    max_trees: int = 400
-    learning_rate: float = 0.06
-    max_leaves: int = 31
-    min_leaf: int = 50
-    l2: float = 1.0
+    max_trees: int = no_option(400)
+    learning_rate: float = no_option(0.06)
+    max_leaves: int = no_option(31)
+    min_leaf: int = no_option(50)
+    l2: float = no_option(1.0)
 
     def __post_init__(self) -> None:
         check_range("max_trees", self.max_trees, 1)

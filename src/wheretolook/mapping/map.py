@@ -1,25 +1,25 @@
-"""Mapping images with their observations, and where a model's features and photographs are."""
+"""The map that everything else is computed from, and where a model's features and photographs are."""
 
 from __future__ import annotations
 
 import warnings
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, NamedTuple, Self
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from wheretolook.features.extractor import DescriptorKind
 from wheretolook.features.sift import SIFT
-from wheretolook.geometry.camera import Camera
+from wheretolook.geometry.camera import Camera, cameras_by_id
 from wheretolook.geometry.poses import Float
 from wheretolook.mapping.colmap_model import (
     ModelArrays,
-    camera_of_model,
-    cameras_of_images,
-    colmap_poses,
     compact_poses,
+    find_camera,
+    holds_model,
     model_arrays,
     read_model,
     registered_names,
@@ -29,7 +29,7 @@ from wheretolook.mapping.config import FrameOptions
 from wheretolook.mapping.feature_files import DATABASE_FILE, HDF5_SUFFIXES, features_kind, kind_in_name
 from wheretolook.mapping.georeference import REPORT_FILE
 from wheretolook.mapping.landmarks import Landmarks, landmarks_of, load_colmap_landmarks
-from wheretolook.mapping.map_frame import MapFrame, find_frame
+from wheretolook.mapping.map_frame import IDENTITY, MapFrame, find_frame, has_photographs
 from wheretolook.utils.errors import ConfigError, MapError, MapWarning
 from wheretolook.utils.files import path_within, read_json_object
 from wheretolook.utils.texts import LOG
@@ -128,90 +128,107 @@ def _reported(model_dir: Path, group: str, name: str) -> Path | None:
 
 
 @dataclass(frozen=True, eq=False)
-class MappedImages:
-    """Images of a map, in the order of their ids in its model, and what they observe.
+class Map:
+    """A Structure-from-Motion map in the world: metres, z up.
 
     Attributes:
-        landmarks: of the map.
-        arrays: its model in the world, in metres with z up; all points are landmarks.
-        poses: (M, 3, 4) cam_from_world.
-        cameras: (M,)
-        offsets: of the log-odds of detection, once estimated, by network and occlusion.
+        landmarks: points with their attributes and descriptors.
+        mapping_poses: (M, 3, 4) cam_from_world of the mapping images, as `compact_poses`; None if unknown.
+        frame: the map's own frame, in which users give and get coordinates.
+        has_photographs: whether the mapping images are photographs, see `scorers.set.score.for_map`.
+        path: folder of its COLMAP model.
+        cameras: of the model by camera_id; empty if not read.
+        images: the mapping images with their observations, in the world; all points are landmarks. None if unknown.
+        whole: the map that this is a part of, if some of its photographs are held out.
+        computed: what is computed once for the map, such as its points on a device.
     """
 
     landmarks: Landmarks
-    arrays: ModelArrays
-    poses: Float
-    cameras: tuple[Camera, ...]
-    offsets: dict[tuple[object, ...], float] = field(default_factory=dict)
-
-    def __len__(self) -> int:
-        return len(self.cameras)
+    mapping_poses: Float | None = None
+    frame: MapFrame = IDENTITY
+    has_photographs: bool = False
+    path: Path | None = None
+    cameras: Mapping[int, Camera] = field(default_factory=dict)
+    images: ModelArrays | None = None
+    whole: Map | None = None
+    computed: dict[Any, Any] = field(default_factory=dict, init=False)
 
     @classmethod
-    def of(cls, landmarks: Landmarks, arrays: ModelArrays, poses: Float, cameras: tuple[Camera, ...]) -> Self:
-        """Return the images of a model, of which only the points that are landmarks count."""
-        return cls(landmarks, select_points(arrays, np.isin(arrays.point_ids, landmarks.ids)), poses, cameras)
+    def open(
+        cls,
+        path: str | Path,
+        database: str | Path | None = None,
+        frame: FrameOptions = FrameOptions(),
+        max_reprojection_error_px: float | None = None,
+        device: str = "cpu",
+        depth_scale: float | None = None,
+    ) -> Map:
+        """Open any COLMAP model (version 3 or 4, binary or text), of any unit and direction up.
 
-    def without(self, held_out: NDArray[np.int64]) -> Landmarks:
-        """Return the landmarks with at least two observations in the other images, with the attributes of those tracks.
+        A `MapWarning` states which points are left out, and what was assumed of an unknown unit or direction up.
+        Without a database torch and Warp are not imported: importing them takes longer than reading 200,000 landmarks.
 
-        `held_out` are rows of images. Coordinates, errors and ambiguities stay as they are.
+        Args:
+            path: folder of the model.
+            database: the COLMAP database the model was built from, or hloc's features in HDF5, for the landmarks'
+                ambiguity, which is unknown without; by default as `choose_features`.
+            frame: how the model's own frame is related to metres with z up.
+            max_reprojection_error_px: landmarks with a larger mean error are left out. None for all that the model's
+                own mapper kept.
+            device: where the ambiguity is computed.
+            depth_scale: metres in a unit of the model by depth images, if there are any.
+
+        Raises:
+            MapError: no usable model in the folder, or the database is unreadable or another's.
+            ConfigError: two sources of the scale disagree.
         """
-        arrays = self.arrays
-        observations = ~np.isin(arrays.observation_image, held_out)
-        point = np.repeat(np.arange(len(arrays.points)), np.diff(arrays.observation_start))
-        counts = np.bincount(point[observations], minlength=len(arrays.points))
+        path = Path(path)
+        model = read_model(path)
+        database = choose_features(path, model, None if database is None else Path(database))
+        arrays = model_arrays(model)
+        found = find_frame(path, model, frame, depth_scale, arrays)
+        arrays = found.of_arrays(arrays)
+        landmarks = load_colmap_landmarks(path, database, max_reprojection_error_px, device, model, arrays=arrays)
+        found.warn(path, landmarks.mapping_distance_m, arrays.image_poses)
+        return cls(
+            landmarks=landmarks,
+            mapping_poses=compact_poses(arrays.image_poses),
+            frame=found,
+            has_photographs=has_photographs(path),
+            path=path,
+            cameras=cameras_by_id(model.cameras, path),
+            images=select_points(arrays, np.isin(arrays.point_ids, landmarks.ids)),
+        )
+
+    def camera(self, camera: Camera | int | None = None) -> Camera:
+        """Return a camera, given as one or by its camera_id in the model; None for the only one.
+
+        Raises MapError, naming the model, if there is no such camera, or there are several.
+        """
+        return find_camera(self.cameras, self.path or Path(), camera)
+
+    def with_images(self) -> Map:
+        """Return the map with its photographs and cameras, read from the model in `path`; as it is if there are none."""
+        if self.images is not None or not self.has_photographs or self.path is None or not holds_model(self.path):
+            return self
+        model = read_model(self.path)
+        arrays = model_arrays(model)
+        images = select_points(arrays, np.isin(arrays.point_ids, self.landmarks.ids))
+        return replace(self, cameras=cameras_by_id(model.cameras, self.path), images=images)
+
+    def without(self, images: ModelArrays, held_out: NDArray[np.int64]) -> Landmarks:
+        """Return the landmarks with at least two observations in images that are not held out, rows of `images`.
+
+        They have the attributes of those tracks. Coordinates, errors and ambiguities stay as they are. `images` are
+        those of the map, or some of their points.
+        """
+        observations = ~np.isin(images.observation_image, held_out)
+        point = np.repeat(np.arange(len(images.points)), np.diff(images.observation_start))
+        counts = np.bincount(point[observations], minlength=len(images.points))
         left = replace(
-            arrays,
+            images,
             observation_start=np.concatenate([[0], np.cumsum(counts)]),
-            observation_image=arrays.observation_image[observations],
-            observation_keypoint=arrays.observation_keypoint[observations],
+            observation_image=images.observation_image[observations],
+            observation_keypoint=images.observation_keypoint[observations],
         )
         return landmarks_of(self.landmarks, select_points(left, counts >= 2))
-
-
-def read_images(model_dir: Path, landmarks: Landmarks) -> MappedImages:
-    """Read the images of a map's COLMAP model, which is in metres with z up. Raises MapError as `read_model`."""
-    model = read_model(model_dir)
-    of_images = colmap_poses(model_dir, model), cameras_of_images(model_dir, model)
-    return MappedImages.of(landmarks, model_arrays(model), *of_images)
-
-
-class ColmapSource(NamedTuple):
-    """Parts of a COLMAP model in the world: metres, z up."""
-
-    landmarks: Landmarks
-    camera: Camera  # the query camera
-    mapping_poses: Float  # cam_from_world (M, 3, 4) of its images
-    frame: MapFrame  # of the model
-    images: MappedImages  # the same images, with their cameras and observations
-
-
-def open_colmap(
-    model: str | Path,
-    camera: Camera | int | None = None,
-    database: str | Path | None = None,
-    max_reprojection_error_px: float | None = None,
-    device: str = "cpu",
-    frame: FrameOptions = FrameOptions(),
-    depth_scale: float | None = None,
-) -> ColmapSource:
-    """Read a COLMAP model; arguments, errors and warnings are those of `LocalizationMap.from_colmap`.
-
-    `depth_scale` is that of `find_frame`. Without a database torch and Warp are not imported: importing them takes
-    longer than reading 200,000 landmarks.
-    """
-    model = Path(model)
-    reconstruction = read_model(model)
-    database = choose_features(model, reconstruction, None if database is None else Path(database))
-    arrays = model_arrays(reconstruction)
-    found = find_frame(model, reconstruction, frame, depth_scale, arrays)
-    arrays = found.of_arrays(arrays)
-    landmarks = load_colmap_landmarks(model, database, max_reprojection_error_px, device, reconstruction, arrays=arrays)
-    poses = found.world_from_map.apply_to_poses(colmap_poses(model, reconstruction))
-    found.warn(model, landmarks.mapping_distance_m, poses)
-    if camera is None or isinstance(camera, int):
-        camera = camera_of_model(reconstruction, model, camera)
-    images = MappedImages.of(landmarks, arrays, poses, cameras_of_images(model, reconstruction))
-    return ColmapSource(landmarks, camera, compact_poses(poses), found, images)

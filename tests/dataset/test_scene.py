@@ -1,4 +1,4 @@
-"""Environments of a scene and of a COLMAP model."""
+"""Scenes of a dataset and of a COLMAP model."""
 
 from pathlib import Path
 
@@ -6,8 +6,8 @@ import pytest
 
 from box_scenes import furnished_room
 from planning.rooms import CAMERA, room_landmarks
-from wheretolook.dataset.environment import ColmapEnvironment, ColmapFiles, EnvironmentConfig, SceneEnvironment
 from wheretolook.dataset.layout import SceneFolder
+from wheretolook.dataset.scene import ColmapFiles, Scene, SceneConfig
 from wheretolook.geometry.lattices import ViewLattice
 from wheretolook.rendering import raycasting
 from wheretolook.scenes.loading import save_glb
@@ -31,7 +31,7 @@ def test_parts_of_a_scene_share_one_ray_caster(files, monkeypatch):
     built = []
     build = raycasting.MeshRaycaster.__init__
     monkeypatch.setattr(raycasting.MeshRaycaster, "__init__", lambda *args: built.append(args) or build(*args))
-    scene = SceneEnvironment(files, CAMERA)
+    scene = Scene(files, CAMERA)
     grid, free = scene.free_voxels(ViewLattice((5, 4, 3), directions=10), scene.space)
     assert 0 < len(free) < len(grid) and scene.space is scene.sampled_space
     assert scene.localization_map.occlusion is scene.occlusion and scene.localization_map.camera == CAMERA
@@ -41,32 +41,32 @@ def test_parts_of_a_scene_share_one_ray_caster(files, monkeypatch):
 def test_without_a_mesh_landmarks_hide_one_another_and_a_unit_is_needed(files):
     files.mesh.unlink()
     with pytest.raises(ConfigError):
-        _ = SceneEnvironment(files, CAMERA).occlusion
+        _ = Scene(files, CAMERA).occlusion
     write_json(files.map / "report.json", {"scale": {"source": "unknown"}})
-    scene = SceneEnvironment(files, CAMERA)
+    scene = Scene(files, CAMERA)
     assert scene.is_photographed and isinstance(scene.occlusion, HiddenPointRemoval)
-    none = EnvironmentConfig(OcclusionConfig(model="none"))
-    assert SceneEnvironment(files, CAMERA, none).occlusion_config.model == "none"
+    none = SceneConfig(OcclusionConfig(model="none"))
+    assert Scene(files, CAMERA, none).occlusion_config.model == "none"
     with pytest.raises(MapError):
         _ = scene.space
     write_json(files.map / "report.json", {"scale": {"source": "unknown", "factor": 0.3}})  # scaled by its depth
-    assert SceneEnvironment(files, CAMERA).frame.doubts
+    assert Scene(files, CAMERA).frame.doubts
 
 
 @pytest.mark.parametrize(
     ("occlusion", "mesh", "depth"), [("mesh", None, None), ("tsdf", "m", None), ("x", None, None), ("", "m", "d")]
 )
 def test_an_occlusion_model_needs_its_files(occlusion, mesh, depth):
-    files = ColmapFiles(Path("sparse"), mesh=mesh and Path(mesh), depth=depth and Path(depth))
     with pytest.raises(ConfigError):
-        ColmapEnvironment(files, occlusion=occlusion)
+        files = ColmapFiles(Path("sparse"), mesh=mesh and Path(mesh), depth=depth and Path(depth))
+        Scene.of_colmap(files, occlusion=occlusion)
 
 
 def test_the_most_accurate_occlusion_model_is_the_default(files):
-    by_mesh = ColmapEnvironment(ColmapFiles(Path("sparse"), mesh=files.mesh))
+    by_mesh = Scene.of_colmap(ColmapFiles(Path("sparse"), mesh=files.mesh))
     assert by_mesh.available_occlusion == ("mesh", "hidden-points", "none") and by_mesh.occlusion_config.model == "mesh"
-    assert isinstance(ColmapEnvironment(ColmapFiles(Path("sparse"))).occlusion, HiddenPointRemoval)
-    cached = ColmapEnvironment(ColmapFiles(Path("sparse")), config=EnvironmentConfig(occlusion_cache_bytes=1 << 20))
+    assert isinstance(Scene.of_colmap(ColmapFiles(Path("sparse"))).occlusion, HiddenPointRemoval)
+    cached = Scene.of_colmap(ColmapFiles(Path("sparse")), config=SceneConfig(occlusion_cache_bytes=1 << 20))
     assert isinstance(cached.occlusion, CachedOcclusion)
 
 

@@ -67,10 +67,7 @@ class TrackingConfig:
         return str(self.root / "artifacts")
 
 
-_FREE_BYTES = 2**20  # required before work starts
-_LOCK_WAIT_S = 60.0  # for another process that creates the store, which takes it 4 s on two cores
 _FIX = "Repair or move the store, or name another folder: --tracking.folder FOLDER."
-_MISREAD = re.compile(r"\?|%[0-9a-fA-F]{2}")  # characters that SQLAlchemy interprets in the path of a database
 
 
 def check_store(tracking: TrackingConfig) -> None:
@@ -86,7 +83,7 @@ def check_store(tracking: TrackingConfig) -> None:
             raise TrackingError("the store is read-only", path=tracking.root / "mlflow.db", fix=_FIX)
         for folder in (tracking.root, artifacts):
             with storage_errors(folder), TemporaryFile(dir=folder) as file:
-                file.write(bytes(_FREE_BYTES))
+                file.write(bytes(2**20))
 
 
 def client(tracking: TrackingConfig) -> MlflowClient:
@@ -121,7 +118,8 @@ def warn_not_logged(what: str, error: TrackingError) -> None:
 @cache
 def _client(root: Path, uri: str) -> MlflowClient:
     database = root / "mlflow.db"
-    misread = _MISREAD.search(str(root))
+    # characters that SQLAlchemy interprets in the path of a database
+    misread = re.search(r"\?|%[0-9a-fA-F]{2}", str(root))
     if misread:
         fix = "Name another folder: --tracking.folder FOLDER."
         raise TrackingError("MLflow misreads the path of this folder", path=root, value=misread[0], fix=fix)
@@ -137,7 +135,8 @@ def _create(database: Path) -> None:
     """Create an empty store in a temporary folder and move it into place, by one process at a time."""
     with storage_errors(database):
         database.parent.mkdir(parents=True, exist_ok=True)
-    with hold(database.with_name(".making.lock"), "creating the MLflow store", wait_s=_LOCK_WAIT_S):
+    # another process creates it in 4 s on two cores
+    with hold(database.with_name(".making.lock"), "creating the MLflow store", wait_s=60.0):
         if database.exists():
             return
         with temporary_folder() as folder:
@@ -228,26 +227,21 @@ digits first."""
 ALL_METHODS = "all methods"
 """What a comparison of methods runs."""
 
-NOTES_GROUP = "wheretolook.experiment_notes"
-"""Entry points of functions (stage, experiment_id) -> tags that describe a new experiment."""
 
 _MADE_BY = "made_by"  # tag of experiments of a dataset and purpose
-_KIND_TAGS = {"mlflow.experimentKind": "custom_model_development"}  # lets MLflow open the table of runs
-_METRICS_PER_BATCH = 800  # MLflow takes 1000 metrics and parameters together
-_RUNS_PER_PAGE = 50
-_PURPOSES = {
-    "evaluate": "evaluation",
-    "train": "training",
-    "adapt": "adapting",
-    "plan": "plans",
-    "label": "labels",
-    "benchmark": "benchmarks",
-}
 
 
 def experiment_name(stage: str, dataset: str) -> str:
     """Return the name of the experiment of a stage's runs on a dataset, such as "release: evaluation"; "" for no dataset."""
-    return ": ".join(filter(None, (dataset, _PURPOSES.get(stage, stage))))
+    purposes = {
+        "evaluate": "evaluation",
+        "train": "training",
+        "adapt": "adapting",
+        "plan": "plans",
+        "label": "labels",
+        "benchmark": "benchmarks",
+    }
+    return ": ".join(filter(None, (dataset, purposes.get(stage, stage))))
 
 
 def run_name(what: str, stage: str, dataset: str) -> str:
@@ -285,10 +279,13 @@ def experiment_id(mlflow_client: MlflowClient, tracking: TrackingConfig, stage: 
             break
         if known.lifecycle_stage == "active" and known.artifact_location == tracking.artifacts:
             return str(known.experiment_id)
-    tags = _KIND_TAGS | ({} if tracking.experiment else {_MADE_BY: "wheretolook"})
+    tags = {"mlflow.experimentKind": "custom_model_development"}  # lets MLflow open the table of runs
+    if not tracking.experiment:
+        tags[_MADE_BY] = "wheretolook"
     created = str(mlflow_client.create_experiment(candidate, artifact_location=tracking.artifacts, tags=tags))
     if not tracking.experiment:
-        for entry_point in entry_points(group=NOTES_GROUP):
+        # functions (stage, experiment_id) -> tags that describe a new experiment
+        for entry_point in entry_points(group="wheretolook.experiment_notes"):
             for tag, text in entry_point.load()(stage, created).items():
                 mlflow_client.set_experiment_tag(created, tag, text)
     return created
@@ -351,8 +348,9 @@ def log_metrics(mlflow_client: MlflowClient, run_id: str, steps: Iterable[tuple[
         for name, value in values.items()
         if math.isfinite(value)
     ]
-    for begin in range(0, len(metrics), _METRICS_PER_BATCH):
-        mlflow_client.log_batch(run_id, metrics=metrics[begin : begin + _METRICS_PER_BATCH])
+    step = 800  # MLflow takes 1000 metrics and parameters together
+    for begin in range(0, len(metrics), step):
+        mlflow_client.log_batch(run_id, metrics=metrics[begin : begin + step])
 
 
 @dataclass(frozen=True)
@@ -404,7 +402,7 @@ def finished_runs(
     order = ["attributes.start_time DESC"]
     token: str | None = None
     while searched and token != "":
-        page = mlflow_client.search_runs(searched, query, max_results=_RUNS_PER_PAGE, order_by=order, page_token=token)
+        page = mlflow_client.search_runs(searched, query, max_results=50, order_by=order, page_token=token)
         for run in page:
             matches = all(run.data.tags.get(key) == str(value) for key, value in (tags or {}).items())
             matches &= all(run.data.params.get(key) == str(value) for key, value in (params or {}).items())

@@ -78,7 +78,6 @@ PHOTOGRAPHS = "photographs"  # value of the column `candidates` in rows of held-
 RELEASED_DIVISOR = 0.527
 """Divisor of every share in the paper's released code, whatever the threshold, the scenes and N."""
 
-_PAIRED = ("difference", "difference_low", "difference_high", "p")
 _CALIBRATION = {"ece": np.nan, "ece_scaled": np.nan, "temperature": np.nan}  # columns where they are unknown
 
 Choices = Mapping[tuple[str, int], TopN]  # by method, the oracle included, and N
@@ -272,7 +271,8 @@ def _share_columns(
     columns["released"] = columns["raw"] / RELEASED_DIVISOR
     add("regret", best - good, chosen)
     if not reference:
-        columns |= dict.fromkeys(_PAIRED, np.full(good.shape[1:], np.nan))
+        for name in ("difference", "difference_low", "difference_high", "p"):
+            columns[name] = np.full(good.shape[1:], np.nan)
     else:
         difference = good - tops[reference].good[:, None]
         add("difference", difference, chosen)
@@ -320,15 +320,6 @@ CALIBRATION_CSV = "calibration.csv"
 
 VARIANTS_CSV = "variants.csv"
 """In a release's `results/`: scores of the networks for all inputs, as `scores.csv`, before one was chosen to ship."""
-
-LOCATIONS_PARQUET = "locations.parquet"  # artifact of each nested run, see `location_table`
-
-_RUN_KEY = ("method", "occlusion", "candidates")  # one nested run for each combination
-_OF_ALL_VIEWS = ("n_locations", "average_precision", "roc_auc", "ece", "ece_scaled", "temperature")
-"""Columns of a score table that do not depend on N, logged once."""
-_OF_EACH_THRESHOLD = ("raw", "any", "normalized", "regret")
-_OF_FIRST_THRESHOLD = ("regret_low", "regret_high", "difference", "difference_low", "difference_high", "p")
-"""Columns that are logged for each N; `scores.csv`, an artifact, has all. Each metric costs MLflow 0.3 ms."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -378,14 +369,18 @@ def runs_of_rows(table: pd.DataFrame, params: Mapping[str, Any]) -> Iterator[Nes
     result) and `top-1/apartment-210/regret_0.05m_0.4deg`.
     """
     keys = threshold_keys(table)
-    of_pooled = [f"{name}_{key}" for key in keys for name in _OF_EACH_THRESHOLD]
-    of_pooled += [f"{name}_{keys[0]}" for name in _OF_FIRST_THRESHOLD]
+    of_pooled = [f"{name}_{key}" for key in keys for name in ("raw", "any", "normalized", "regret")]
+    # not all columns, as each metric costs MLflow 0.3 ms; `scores.csv`, an artifact, has them
+    strictest = ("regret_low", "regret_high", "difference", "difference_low", "difference_high", "p")
+    of_pooled += [f"{name}_{keys[0]}" for name in strictest]
     of_pooled += [FIRST + name for name in of_pooled if FIRST + name in table]
-    for key, rows in table.groupby(list(_RUN_KEY), sort=False):
-        own = dict(zip(_RUN_KEY, map(str, key), strict=True))
+    names = ["method", "occlusion", "candidates"]
+    for key, rows in table.groupby(names, sort=False):
+        own = dict(zip(names, map(str, key), strict=True))
         pooled = rows[rows["scene"] == ALL]
         metrics = first_metrics(pooled)
-        metrics |= {name: float(pooled[name].iloc[0]) for name in _OF_ALL_VIEWS}
+        for name in ("n_locations", "average_precision", "roc_auc", "ece", "ece_scaled", "temperature"):
+            metrics[name] = float(pooled[name].iloc[0])  # the same for every N
         metrics |= _metrics_by_n(pooled, of_pooled) | _metrics_by_n(rows[rows["scene"] != ALL], [f"regret_{keys[0]}"])
         candidates = own["candidates"] if own["candidates"] != ALL else ""
         yield NestedRun(joined(own["method"], own["occlusion"], candidates), {**params, **own}, metrics)
@@ -483,7 +478,7 @@ def log_evaluation(
         for file in results.iterdir():
             if file.is_file() and file.suffix != ".partial":  # left by a killed process
                 client.log_artifact(run, str(file))
-        nested = _runs_with_locations(evaluation.scored, params, config, folder / LOCATIONS_PARQUET)
+        nested = _runs_with_locations(evaluation.scored, params, config, folder / "locations.parquet")
         log_nested(tracking, run, "evaluate", nested)
 
 

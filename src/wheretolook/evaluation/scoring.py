@@ -32,10 +32,7 @@ from wheretolook.utils.files import fingerprint
 from wheretolook.utils.package import WEIGHTS, shipped
 from wheretolook.visibility.config import OcclusionConfig
 
-BATCH = 4096  # views binned and scored at a time
-BUNDLED = "that ships"  # follows the method's name in rows of bundled weights that are compared with others
 Weights = Mapping[Path, str]  # files of weights, and the method that each serves
-_SHARES_OF_THE_MAP = ("expected-inliers", "visible")  # methods whose score is a share of the map's landmarks
 
 
 def compare_methods(
@@ -219,7 +216,7 @@ def score_scenes(
             localization_map = _open_map(scene, occlusion, device, progress)
             used.add(localization_map.occlusion.name)
             of_camera = cache(localization_map.of_camera)
-            batches = ((rows, of_camera(camera)) for camera, rows in views_by_camera(scene, table, BATCH))
+            batches = ((rows, of_camera(camera)) for camera, rows in views_by_camera(scene, table, at_most=4096))
             parts.append(score_batches(scene, poses(table), batches, config, weights, bar))
     return join_scores(parts), " ".join(sorted(used))
 
@@ -269,7 +266,8 @@ def score_batches(
 
 def score_scale(method: str, localization_map: LocalizationMap) -> int:
     """Return the factor that makes a method's scores comparable between maps of different sizes."""
-    return len(localization_map.landmarks) if method in _SHARES_OF_THE_MAP else 1
+    is_share_of_the_map = method in ("expected-inliers", "visible")
+    return len(localization_map.landmarks) if is_share_of_the_map else 1
 
 
 def join_scores(parts: Sequence[Mapping[str, Float]]) -> dict[str, Float]:
@@ -290,7 +288,7 @@ def scorers_of(
         for path in paths if method.weights else [None]:
             options = (config.seed, path, config.heading, anywhere or config.anywhere)
             # files of the same method are distinguished by their names
-            which = BUNDLED if path is not None and path.parent == shipped(WEIGHTS) else path
+            which = "that ships" if path is not None and path.parent == shipped(WEIGHTS) else path
             name = f"{method.name} {which}" if method.name in by_name else method.name
             by_name[name] = make_scorer(method.name, localization_map, *options)
     return by_name

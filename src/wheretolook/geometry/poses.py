@@ -14,9 +14,6 @@ from wheretolook.utils.errors import PoseError
 
 Float = NDArray[np.floating[Any]]
 
-MAX_ENTRY = 1e12  # of a pose
-RIGID_TOLERANCE = 1e-3  # of the entries of R R^T
-
 
 def transform(cam_from_world: ArrayLike, points: ArrayLike) -> Float:
     """Apply poses (..., 3, 4) to points (N, 3). Returns (..., N, 3) in the target frame."""
@@ -141,7 +138,7 @@ def check_poses(cam_from_world: ArrayLike) -> NDArray[np.float64]:
     poses = as_numbers(cam_from_world)
     if poses.ndim != 3 or poses.shape[1:] != (3, 4):
         raise PoseError("cam_from_world must have shape (B, 3, 4)", value=poses.shape)
-    invalid = np.flatnonzero(~(np.abs(poses) <= MAX_ENTRY).all(axis=(1, 2)))
+    invalid = np.flatnonzero(~(np.abs(poses) <= 1e12).all(axis=(1, 2)))
     if len(invalid):
         raise PoseError(f"pose {invalid[0]} has NaN, infinite or too large entries", value=poses[invalid[0]].tolist())
     return poses
@@ -159,7 +156,7 @@ def rigid_poses(poses: ArrayLike) -> NDArray[np.float64]:
     checked = check_poses(matrices[:, :3] if homogeneous else matrices)
     rotation = checked[:, :, :3]
     off = np.abs(rotation @ np.swapaxes(rotation, 1, 2) - np.eye(3)).max((1, 2))
-    rigid = (off < RIGID_TOLERANCE) & (np.linalg.det(rotation) > 0)
+    rigid = (off < 1e-3) & (np.linalg.det(rotation) > 0)
     if homogeneous:
         rigid &= (matrices[:, 3] == (0, 0, 0, 1)).all(1)
     for row in np.flatnonzero(~rigid):

@@ -25,8 +25,6 @@ from wheretolook.planning.config import PathConfig
 from wheretolook.planning.viewpoint_map import ViewpointMap
 from wheretolook.utils.errors import PlanningError
 
-MAX_TURN_DEG = 30.0  # limit of the Active Localization Benchmark between waypoints
-
 
 @dataclass(frozen=True, eq=False)
 class TurnLimit:
@@ -43,8 +41,8 @@ class TurnLimit:
     pan_tilt: bool = False
 
     @classmethod
-    def of(cls, directions: ArrayLike, max_turn_deg: float = MAX_TURN_DEG, pan_tilt: bool = False) -> TurnLimit:
-        """Make the limit for a lattice of unit vectors (D, 3), such as `direction_lattice` gives.
+    def of(cls, directions: ArrayLike, max_turn_deg: float = 30.0, pan_tilt: bool = False) -> TurnLimit:
+        """Make the limit for a lattice of unit vectors (D, 3), by default that of the Active Localization Benchmark.
 
         Raises ValueError for a limit that is negative or NaN.
         """
@@ -133,16 +131,6 @@ def check_reached(values: Float, waypoint: int, limit: TurnLimit) -> None:
         raise PlanningError(problem, value=waypoint, fix=fix)
 
 
-LIMIT_STEP_DEG = 0.5
-"""Limits on turns are rounded down to multiples of this, so that routes of similar spacing share a `TurnLimit`."""
-
-SHORT_ROUTE = "short route"
-SEARCH = "search"
-IMPROVEMENT = "improvement"
-"""How a path was found: as a short route with views chosen along it, by the search over positions and views, or by
-improving either."""
-
-
 @dataclass(frozen=True, eq=False)
 class Stop:
     """A position of a path where the camera turns away from the path's view and back (`wheretolook.planning.stops`).
@@ -172,7 +160,8 @@ class PlannedPath:
         scores: (W,) from the viewpoint map, 0 outside its free voxels, NaN without a map; from `plan_by_methods` the
             scores of these exact poses.
         cost: see `PathConfig`, by the trapezoidal rule over the map's scores.
-        found_by: `SHORT_ROUTE`, `SEARCH` or `IMPROVEMENT`; empty if the path was not planned.
+        found_by: "short route", with views chosen along it; "search" over positions and views; or "improvement" of
+            either. Empty if the path was not planned.
         stops: in the order of the path, not part of the cost.
     """
 
@@ -313,9 +302,10 @@ class RouteViews:
         return float((steps * (1 + self.config.score_weight * (1 - (scores[1:] + scores[:-1]) / 2))).sum())
 
     def _limit(self, step_m: float) -> TurnLimit:
-        number = int(self.config.max_turn_deg_per_m * step_m / LIMIT_STEP_DEG)
+        # rounded down to half degrees, so that routes of similar spacing share a limit
+        number = int(self.config.max_turn_deg_per_m * step_m / 0.5)
         if number not in self._limits:
-            self._limits[number] = TurnLimit.of(self.map.directions, number * LIMIT_STEP_DEG, pan_tilt=True)
+            self._limits[number] = TurnLimit.of(self.map.directions, number * 0.5, pan_tilt=True)
         return self._limits[number]
 
 

@@ -35,9 +35,6 @@ from wheretolook.visibility.counting import SurveyOptions, survey
 
 Text = str | None  # text of progress bars; None shows none
 
-VIEWS_AT_ONCE = 16_384
-"""Views scored at a time, in whole locations: enough to fill a GPU, few enough for the progress bar to move."""
-
 
 def build_viewpoint_map(
     scorer: Scorer, grid: VoxelGrid, free: ArrayLike, directions: ArrayLike, lattice: str = "", progress: Text = None
@@ -96,7 +93,8 @@ def _score_and_count(
     counted = survey(localization_map.camera, rotations, locations, points, localization_map.occlusion, options)
     ranked = np.empty((len(locations), len(directions)), dtype=np.uint16)
     scores = np.empty(ranked.shape, dtype=np.float32)
-    block = max(1, VIEWS_AT_ONCE // len(directions))
+    # enough views at once to fill a GPU, few enough for the progress bar to move
+    block = max(1, 16_384 // len(directions))
     text = progress and f"{progress}: score"
     with tqdm(total=len(locations), desc=text, unit="voxel", disable=progress is None) as bar:
         for begin in range(0, len(locations), block):
@@ -130,12 +128,6 @@ def _origin(scorer: Scorer, lattice: str, digests: NDArray[np.uint64]) -> MapOri
     if isinstance(camera, PinholeCamera):  # stored in one form, whatever the model
         intrinsics |= {"model": "PINHOLE", "params": [float(v) for v in (camera.fx, camera.fy, camera.cx, camera.cy)]}
     return MapOrigin(scorer.name, lattice, intrinsics, localization_map.occlusion.name, digest)
-
-
-REACH = 2  # voxels along each axis from which views may be taken
-
-INSIDE = np.stack(np.meshgrid(*[(-1 / 3, 0.0, 1 / 3)] * 3, indexing="ij"), -1).reshape(-1, 3)
-"""Points (27, 3) of a voxel that are tested for free space, relative to its centre in units of its size."""
 
 
 def scene_scorer(
@@ -209,14 +201,17 @@ def fill_partially_free_voxels(viewpoint_map: ViewpointMap, space: Space) -> Vie
     size = viewpoint_map.grid.voxel_m
     known = np.flatnonzero(rows >= 0)
     unknown = np.flatnonzero(rows < 0)
-    points = centers[unknown][:, None] + INSIDE * size
-    free = space.is_free(points.reshape(-1, 3)).reshape(len(unknown), len(INSIDE))
-    order = np.argsort((INSIDE**2).sum(1), kind="stable")
+    # points (27, 3) of a voxel that are tested, relative to its centre in units of its size
+    offsets = np.stack(np.meshgrid(*[(-1 / 3, 0.0, 1 / 3)] * 3, indexing="ij"), -1).reshape(-1, 3)
+    points = centers[unknown][:, None] + offsets * size
+    free = space.is_free(points.reshape(-1, 3)).reshape(len(unknown), len(offsets))
+    order = np.argsort((offsets**2).sum(1), kind="stable")
     for voxel, inside, is_free in zip(unknown, points, free, strict=True):
         if not is_free.any():
             continue
         start = inside[order[is_free[order]][0]]  # the free point nearest to the centre
-        near = known[(np.abs(centers[known] - centers[voxel]) <= (REACH + 1e-6) * size).all(1)]
+        # at most two voxels away along each axis
+        near = known[(np.abs(centers[known] - centers[voxel]) <= (2 + 1e-6) * size).all(1)]
         near = near[np.argsort(np.linalg.norm(centers[near] - start, axis=1), kind="stable")]
         if len(near):
             clear = space.segments_are_free(np.tile(start, (len(near), 1)), centers[near])

@@ -29,9 +29,6 @@ from wheretolook.scorers.base import Scorer
 from wheretolook.scorers.registry import is_probability
 from wheretolook.utils.errors import ConfigError, PlanningError
 
-COMPASS = np.stack([np.cos(np.arange(8) * np.pi / 4), np.sin(np.arange(8) * np.pi / 4)], axis=1)
-"""Steps (8, 2) in the plane that touches the sphere at the current axis."""
-
 
 def refine_directions(
     scorer: Scorer,
@@ -79,7 +76,8 @@ def _neighbour_directions(axes: Float, step_deg: Float) -> Float:
     u = np.cross(axes, np.eye(3)[np.abs(axes).argmin(axis=1)])  # with a coordinate axis that is not parallel
     u /= np.linalg.norm(u, axis=1, keepdims=True)
     angle = np.radians(step_deg)[:, None, None]
-    across = COMPASS[:, :1] * u[:, None] + COMPASS[:, 1:] * np.cross(axes, u)[:, None]
+    at = np.arange(8)[:, None] * np.pi / 4  # in the plane that touches the sphere at the axis
+    across = np.cos(at) * u[:, None] + np.sin(at) * np.cross(axes, u)[:, None]
     return np.asarray(np.cos(angle) * axes[:, None] + np.sin(angle) * across)
 
 
@@ -90,16 +88,6 @@ def _within(candidates: Float, start: Float, max_angle_deg: float) -> Float:
     across = candidates - (candidates * start).sum(-1, keepdims=True) * start
     across /= np.maximum(np.linalg.norm(across, axis=-1, keepdims=True), 1e-12)
     return np.where(outside, np.cos(limit) * start + np.sin(limit) * across, candidates)
-
-
-TURNS_DEG = (45.0, 90.0, 180.0, None)
-"""Limits on the rotation from the path's view to the last look, in the order they are tried; None for no limit."""
-
-NEAR_DEG = 60.0
-N_NEAR = 8
-"""Number of candidates within this angle of the path's view, so that small rotations are possible."""
-
-MIN_PROBABILITY = 1e-3  # probabilities are clipped to this distance from 0 and 1 before odds are taken
 
 
 def stops_along(
@@ -169,8 +157,9 @@ def _best_stop(scorer: Scorer, view: _View, directions: Float, config: StopConfi
     if len(apart) == 0:
         return None
     scores = scorer.score_directions(view.position[None], apart)[0]
-    near = np.flatnonzero(apart @ view.axis > math.cos(math.radians(NEAR_DEG)))
-    rows = np.union1d(candidates(apart, scores, CANDIDATES), near[candidates(apart[near], scores[near], N_NEAR)])
+    near = np.flatnonzero(apart @ view.axis > math.cos(math.radians(60.0)))
+    # further ones near the path's view, so that small rotations are possible
+    rows = np.union1d(candidates(apart, scores, CANDIDATES), near[candidates(apart[near], scores[near], 8)])
     axes = np.concatenate([view.axis[None], apart[rows]])
     single = np.append(view.score, scores[rows])
     visible = candidate_views(scorer, view.position, axes, single)
@@ -180,7 +169,7 @@ def _best_stop(scorer: Scorer, view: _View, directions: Float, config: StopConfi
     best = None
     best_gain = 0.0
     for n in range(2, min(config.looks, len(axes)) + 1):
-        for limit in TURNS_DEG:
+        for limit in (45.0, 90.0, 180.0, None):  # degrees from the path's view to the last look
             try:
                 chosen = select_views(visible, set_score, n, rotations, limit, required=0)
             except PlanningError:  # no directions within the limit
@@ -201,5 +190,5 @@ def _best_stop(scorer: Scorer, view: _View, directions: Float, config: StopConfi
 
 def _raised(probability: float, before: float, after: float) -> float:
     """Raise the odds of a probability by the ratio of the odds of `after` and `before`."""
-    a, b, c = finite_log_odds([probability, before, after], MIN_PROBABILITY)
+    a, b, c = finite_log_odds([probability, before, after], 1e-3)
     return float(expit(a + c - b))

@@ -48,7 +48,6 @@ ARRAYS = {
 }
 """Little-endian type, shape and meaning of each array; each is a file `<name>.npy`."""
 
-_WAIT_S = 120.0  # for another process that writes into the same folder
 
 REBUILD = "Build it again with `wheretolook viewpoint-map`, or get the folder again."
 
@@ -119,7 +118,7 @@ def write_map(
     """
     folder = Path(folder).resolve()  # so that "." has a name too
     _check_replaceable(folder)
-    with hold(folder.with_name(f".{folder.name}.lock"), "viewpoint map", wait_s=_WAIT_S), atomic_folder(folder) as new:
+    with hold(folder.with_name(f".{folder.name}.lock"), "viewpoint map", wait_s=120.0), atomic_folder(folder) as new:
         _write(new, grid, origin, arrays)
 
 
@@ -443,8 +442,9 @@ class ViewpointMap:
             return None
         at = (np.asarray(point, dtype=np.float64) - self.grid.lower) / self.grid.voxel_m - 0.5
         low = np.floor(at).astype(np.int64)
-        corners = low + _CORNERS
-        weights = np.prod(np.where(_CORNERS == 1, at - low, 1 - (at - low)), axis=1)
+        upper = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), axis=-1).reshape(8, 3)
+        corners = low + upper
+        weights = np.prod(np.where(upper == 1, at - low, 1 - (at - low)), axis=1)
         exists = ((corners >= 0) & (corners < self.grid.shape)).all(axis=1)
         rows = self.row_of_voxel[np.ravel_multi_index(tuple(corners[exists].T), self.grid.shape)]
         weights = weights[exists][rows >= 0]
@@ -498,6 +498,3 @@ class ViewpointMap:
 def _ranks_nothing(error: IndexError) -> MapFormatError:
     """Return the error for a damaged file that was mapped into memory without comparing its checksum."""
     return MapFormatError(f"ranked.npy is damaged: {error}", fix=REBUILD)
-
-
-_CORNERS = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), axis=-1).reshape(8, 3)

@@ -28,8 +28,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-MAX_SIDE_PX = 1600  # larger images are reduced
-MAX_SIDE_RATIO = 1.01  # of the proportions of an image and of its camera
 MAX_FOCAL_RATIO = 1.05  # of focal lengths that count as equal; those in EXIF data are rounded
 
 
@@ -123,14 +121,14 @@ def distinct_names(paths: Sequence[Path]) -> list[str]:
 def _has_proportions(camera: Camera, rgb: NDArray[np.uint8]) -> bool:
     height, width = rgb.shape[:2]
     ratio = width * camera.height / (height * camera.width)
-    return 1 / MAX_SIDE_RATIO <= ratio <= MAX_SIDE_RATIO
+    return 1 / 1.01 <= ratio <= 1.01
 
 
 def _fitted(name: str, rgb: NDArray[np.uint8], camera: Camera) -> QueryImage:
-    """Reduce an image to the size of its camera and to `MAX_SIDE_PX`, and return it with the camera of that size."""
+    """Reduce an image to the size of its camera and to 1,600 px, and return it with the camera of that size."""
     import pycolmap
 
-    reduced = reduce_photograph(rgb, min(MAX_SIDE_PX, max(camera.width, camera.height)))
+    reduced = reduce_photograph(rgb, min(1600, max(camera.width, camera.height)))
     height, width = reduced.shape[:2]
     if (width, height) != (camera.width, camera.height):
         scaled = pycolmap.Camera(**camera.colmap.record())
@@ -254,7 +252,8 @@ class Localized:
         """Return a row for each image; NaN where there is no pose."""
         import pandas as pd
 
-        values = np.full((len(self), len(POSE_COLUMNS)), np.nan)
+        columns = (*"xyz", "yaw_deg", "pitch_deg", "qw", "qx", "qy", "qz", "deviation", "deviation_deg")
+        values = np.full((len(self), len(columns)), np.nan)
         if self.cam_from_world is not None:
             quaternions = quaternion_from_rotation(np.swapaxes(self.cam_from_world[:, :, :3], 1, 2))
             angles = np.degrees(pan_tilt_angles(self.cam_from_world[:, 2, :3] @ self.frame.world_from_map.rotation.T))
@@ -266,7 +265,7 @@ class Localized:
                 "image": self.names,
                 "status": self.status,
                 "probability": self.probability,
-                **dict(zip(POSE_COLUMNS, values.T, strict=True)),
+                **dict(zip(columns, values.T, strict=True)),
                 "n_matches": self.n_matches,
                 "n_inliers": self.n_inliers,
                 "n_rivals": len(self.rivals),
@@ -274,9 +273,6 @@ class Localized:
                 "reason": self.reason,
             }
         )
-
-
-POSE_COLUMNS = (*"xyz", "yaw_deg", "pitch_deg", "qw", "qx", "qy", "qz", "deviation", "deviation_deg")
 
 
 def check_localized_format(path: Path) -> str:

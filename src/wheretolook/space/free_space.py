@@ -18,9 +18,6 @@ from wheretolook.rendering.raycasting import MeshRaycaster, RayHits
 from wheretolook.space.config import FreeSpaceConfig, MappedSpaceConfig
 from wheretolook.utils.errors import MapError
 
-STEP_M = 0.02  # between the points of a path segment that must be near mapping cameras
-_OUTLIERS = 0.01  # share of landmarks left out at either end of each axis, since a wrong one may lie anywhere
-
 
 class MappedSpace:
     """Tests locations against a map's landmarks (N, 3) m and the places (M, 3) m where its images were taken.
@@ -43,7 +40,7 @@ class MappedSpace:
         reach = self.config.max_camera_distance_m
         lowest = centers.min(0)
         highest = centers.max(0)
-        low, high = np.quantile(points, (_OUTLIERS, 1 - _OUTLIERS), axis=0)
+        low, high = np.quantile(points, (0.01, 0.99), axis=0)
         lower = np.maximum(lowest - reach, np.minimum(low, lowest))
         upper = np.minimum(highest + reach, np.maximum(high, highest))
         self.bounds: Float = np.stack([lower, upper])
@@ -79,13 +76,9 @@ class MappedSpace:
         return bool((distance >= self.config.clearance_m).all())
 
     def _stays_near_cameras(self, start: Float, end: Float) -> bool:
-        steps = max(2, int(np.ceil(np.linalg.norm(end - start) / STEP_M)) + 1)
+        steps = max(2, int(np.ceil(np.linalg.norm(end - start) / 0.02)) + 1)
         points = start + np.linspace(0, 1, steps)[:, None] * (end - start)
         return bool((self._cameras.query(points)[0] <= self.config.max_camera_distance_m).all())
-
-
-AT_ONCE = 1 << 18  # points tested at a time: 34 rays each, about 2 KB
-_N_SIDEDNESS_POINTS = 1024  # random points that decide whether triangles are one-sided
 
 
 class FreeSpace:
@@ -140,8 +133,9 @@ class FreeSpace:
         return np.where(is_floor, at[:, 2] - hits.distance_m, np.nan)
 
     def _is_enclosed(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
-        if len(points) > AT_ONCE:
-            parts = [self._is_enclosed(points[start : start + AT_ONCE]) for start in range(0, len(points), AT_ONCE)]
+        step = 1 << 18  # the 34 rays of a point take about 2 KB
+        if len(points) > step:
+            parts = [self._is_enclosed(points[start : start + step]) for start in range(0, len(points), step)]
             return np.concatenate(parts)
         hits = self._cast_sphere(points)
         surface = np.isfinite(hits.distance_m) & (hits.front | self.two_sided)
@@ -160,7 +154,7 @@ class FreeSpace:
     def _sees_fronts(self) -> bool:
         """Whether most of the points that are free in a two-sided scene see mostly fronts."""
         low, high = self.bounds
-        points = np.random.default_rng(0).uniform(low, high, size=(_N_SIDEDNESS_POINTS, 3))
+        points = np.random.default_rng(0).uniform(low, high, size=(1024, 3))
         hits = self._cast_sphere(points[self.is_free(points)])
         hit = np.isfinite(hits.distance_m)
         if not hit.any():
@@ -178,10 +172,6 @@ def _sphere_directions() -> NDArray[np.float64]:
         ring = [np.cos(azimuth) * level, np.sin(azimuth) * level, np.full(count, np.sin(elevation))]
         rings.append(np.stack(ring, axis=1))
     return np.concatenate([*rings, [(0.0, 0.0, 1.0), (0.0, 0.0, -1.0)]])
-
-
-CELL_M = 0.05
-"""Side of the cells that were seen through or not; half the clearance if that is less, but at least a voxel."""
 
 
 class TsdfSpace(FreeSpace):
@@ -208,7 +198,7 @@ class TsdfSpace(FreeSpace):
     ) -> None:
         super().__init__(volume.surface(), replace(config, two_sided=False), device)
         self._step_m = volume.config.voxel_size_m
-        cell_m = max(self._step_m, min(CELL_M, self.config.clearance_m / 2))
+        cell_m = max(self._step_m, min(0.05, self.config.clearance_m / 2))
         nx, ny, nz = np.maximum(np.ceil((self.bounds[1] - self.bounds[0]) / cell_m), 1).astype(int).tolist()
         self.cells = VoxelGrid.over(self.bounds, (nx, ny, nz))
         seen = seen_through(self.cells.centers(), images, volume.config.max_depth_m, progress)

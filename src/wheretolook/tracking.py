@@ -35,7 +35,7 @@ from wheretolook.utils.processes import hold
 if TYPE_CHECKING:
     import pandas as pd
     from mlflow import MlflowClient
-    from mlflow.entities import Metric, Run
+    from mlflow.entities import Run
 
 
 @dataclass(frozen=True)
@@ -323,11 +323,10 @@ def _open_run(mlflow_client: MlflowClient, experiment: str, name: str, tags: Map
 
 def log(mlflow_client: MlflowClient, run_id: str, params: Values = None, metrics: Values = None) -> None:
     """Log parameters and metrics of a run. Metrics that are not finite are skipped."""
-    from mlflow.entities import Param
-
     log_metrics(mlflow_client, run_id, [(0, metrics or {})])
     if params:
-        texts = [Param(key, str(value)) for key, value in params.items()]
+        param = mlflow_package().entities.Param
+        texts = [param(key, str(value)) for key, value in params.items()]
         mlflow_client.log_batch(run_id, params=texts)
 
 
@@ -339,18 +338,14 @@ def log_history(mlflow_client: MlflowClient, run_id: str, history: pd.DataFrame)
 
 def log_metrics(mlflow_client: MlflowClient, run_id: str, steps: Iterable[tuple[int, Mapping[Any, Any]]]) -> None:
     """Log metrics of steps in batches. Metrics that are not finite are skipped."""
-    from mlflow.entities import Metric
-
+    metric = mlflow_package().entities.Metric
     now = int(time.time() * 1000)
-    metrics: list[Metric] = [
-        Metric(str(name), float(value), now, step)
-        for step, values in steps
-        for name, value in values.items()
-        if math.isfinite(value)
-    ]
-    step = 800  # MLflow takes 1000 metrics and parameters together
-    for begin in range(0, len(metrics), step):
-        mlflow_client.log_batch(run_id, metrics=metrics[begin : begin + step])
+    metrics = []
+    for step, values in steps:
+        metrics += [metric(str(name), float(v), now, step) for name, v in values.items() if math.isfinite(v)]
+    at_once = 800  # MLflow takes 1000 metrics and parameters together
+    for begin in range(0, len(metrics), at_once):
+        mlflow_client.log_batch(run_id, metrics=metrics[begin : begin + at_once])
 
 
 @dataclass(frozen=True)

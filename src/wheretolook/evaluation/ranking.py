@@ -118,8 +118,9 @@ def _scene_views(number: int, scene: SceneFolder, table: pd.DataFrame, config: E
     if table.empty:
         raise TableError("the table has no viewpoints", path=scene.table, fix="Run the sample stage again.")
     try:
-        labels = [table, *([by_first(table)] if both else [])]
-        good = np.stack([is_good(one, *limits) for one in labels for limits in config.thresholds], axis=-1)
+        good = []
+        for labelled in [table, by_first(table)] if both else [table]:
+            good += [is_good(labelled, max_m, max_deg) for max_m, max_deg in config.thresholds]
     except TableError as error:
         raise TableError(error.problem, path=scene.table, value=error.value, fix=error.fix) from None
     location_id = table["location_id"].to_numpy(np.int64)
@@ -136,7 +137,7 @@ def _scene_views(number: int, scene: SceneFolder, table: pd.DataFrame, config: E
         location_id=location_id,
         block=block[row.reshape(-1)],
         viewpoint_id=table["viewpoint_id"].to_numpy(np.int64),
-        good=good,
+        good=np.stack(good, axis=-1),
     )
 
 

@@ -286,11 +286,12 @@ def scorers_of(
     for method in methods_named(config.methods, scorers()):
         paths = [path for path, kind in weights.items() if kind == method.weights]
         for path in paths if method.weights else [None]:
-            options = (config.seed, path, config.heading, anywhere or config.anywhere)
             # files of the same method are distinguished by their names
             which = "that ships" if path is not None and path.parent == shipped(WEIGHTS) else path
             name = f"{method.name} {which}" if method.name in by_name else method.name
-            by_name[name] = make_scorer(method.name, localization_map, *options)
+            by_name[name] = make_scorer(
+                method.name, localization_map, config.seed, path, config.heading, anywhere or config.anywhere
+            )
     return by_name
 
 
@@ -331,7 +332,7 @@ def photographs_views(photographs: Sequence[HeldOutPhotographs], config: Evaluat
             location_id=one.views["place"].to_numpy(np.int64),
             block=one.views["block"].to_numpy(np.int64),
             viewpoint_id=one.views["photograph"].to_numpy(np.int64),
-            good=np.stack([is_good(one.views, *limits) for limits in config.thresholds], axis=-1),
+            good=np.stack([is_good(one.views, max_m, max_deg) for max_m, max_deg in config.thresholds], axis=-1),
         )
         parts.append(part)
     views = Views.concatenate(parts)

@@ -118,8 +118,14 @@ class TsdfVolume:
         self.config = config
         self.origin = np.asarray(origin, dtype=np.float64)
         self._max_blocks = _max_blocks()
-        layout = ("tsdf", "weight"), (o3d.core.float32,) * 2, [o3d.core.SizeVector([1])] * 2
-        self._grid: Any = o3d.t.geometry.VoxelBlockGrid(*layout, config.voxel_size_m, BLOCK_VOXELS, expected_blocks)
+        self._grid: Any = o3d.t.geometry.VoxelBlockGrid(
+            ("tsdf", "weight"),
+            (o3d.core.float32, o3d.core.float32),
+            [o3d.core.SizeVector([1]), o3d.core.SizeVector([1])],
+            config.voxel_size_m,
+            BLOCK_VOXELS,
+            expected_blocks,
+        )
 
     @classmethod
     def from_images(cls, images: DepthImages, config: TsdfConfig = TsdfConfig(), progress: bool = True) -> TsdfVolume:
@@ -141,20 +147,23 @@ class TsdfVolume:
 
     def integrate(self, image: DepthImage) -> None:
         """Average a depth image into the field. Raises ConfigError if the volume has outgrown the memory."""
-        from open3d import core
-        from open3d.t.geometry import Image
+        import open3d as o3d
 
         depth = image.readings(self.config.max_depth_m)
         rows, columns = (side // 4 * 4 for side in depth.shape)  # Open3D looks for blocks at every fourth pixel
         if not depth[:rows:4, :columns:4].any():
             return  # Open3D would raise
         pose = np.vstack([poses_from(image.cam_from_world, self.origin), (0, 0, 0, 1)])
-        tensor: Any = core.Tensor
-        limits = 1.0, float(self.config.max_depth_m), float(self.config.truncation_voxels)
-        view = (tensor(image.camera.matrix), tensor(pose))
-        shown = Image(tensor(np.ascontiguousarray(depth)))
-        blocks = self._grid.compute_unique_block_coordinates(shown, *view, *limits)
-        self._grid.integrate(blocks, shown, *view, *limits)
+        shown = o3d.t.geometry.Image(o3d.core.Tensor(np.ascontiguousarray(depth)))
+        view = {
+            "intrinsic": o3d.core.Tensor(image.camera.matrix),
+            "extrinsic": o3d.core.Tensor(pose),
+            "depth_scale": 1.0,
+            "depth_max": float(self.config.max_depth_m),
+            "trunc_voxel_multiplier": float(self.config.truncation_voxels),
+        }
+        blocks = self._grid.compute_unique_block_coordinates(shown, **view)
+        self._grid.integrate(blocks, shown, **view)
         _check_memory(len(self), self.config, self._max_blocks)
 
     def surface(self) -> TexturedMesh:

@@ -24,6 +24,7 @@ from wheretolook.geometry.poses import (
     rotation_looking_along,
 )
 from wheretolook.localization.confidence import LogisticRegression
+from wheretolook.scorers.registry import find
 from wheretolook.utils.errors import ConfigError, PlanningError
 
 if TYPE_CHECKING:
@@ -70,7 +71,6 @@ def candidate_views(
     `scores` (D,) of the scorer are the views' probabilities of localizing, if its method predicts those. Where the
     scorer knows no landmark probabilities, and if `certain`, every visible landmark is detected with equal precision.
     """
-    from wheretolook.scorers.registry import find
     from wheretolook.visibility.frustum import LandmarkSets
 
     location = np.asarray(location, dtype=np.float64)

@@ -165,8 +165,9 @@ def plan_informed(
 
 def _short_route(request: PathRequest, budget: _TimeBudget, share: float, max_share: float) -> Float:
     """Find a short route (S, 3) m in a share of the time, or up to `max_share` until there is one."""
-    seconds = share * budget.total_s, max_share * budget.total_s
-    return _Problem(request, None).solve([(0.0, 0.0)], *seconds, budget.bar)[:, :3]
+    time_s = share * budget.total_s
+    max_s = max_share * budget.total_s
+    return _Problem(request, None).solve([(0.0, 0.0)], time_s, max_s, budget.bar)[:, :3]
 
 
 def check_ends(ends: Float, space: Space, bounds: Float, map_from_world: Similarity = IDENTITY.world_from_map) -> None:

@@ -65,9 +65,19 @@ def build_viewpoint_map(
     landmarks = scorer.localization_map.landmarks
     row_of_voxel = np.full(len(grid), -1, dtype=np.int32)
     row_of_voxel[rows] = np.arange(len(rows))
-    by_row = _score_and_count(scorer, grid.centers()[rows], axes, progress)
+    ranked, scores, n_visible = _score_and_count(scorer, grid.centers()[rows], axes, progress)
     digests = landmark_digests(landmarks)
-    return ViewpointMap(grid, row_of_voxel, axes, *by_row, landmarks.ids, digests, _origin(scorer, lattice, digests))
+    return ViewpointMap(
+        grid=grid,
+        row_of_voxel=row_of_voxel,
+        directions=axes,
+        ranked=ranked,
+        scores=scores,
+        n_visible=n_visible,
+        landmark_ids=landmarks.ids,
+        landmark_digests=digests,
+        origin=_origin(scorer, lattice, digests),
+    )
 
 
 def landmark_digests(landmarks: Landmarks) -> NDArray[np.uint64]:

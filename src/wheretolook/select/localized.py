@@ -9,6 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pandas as pd
+import pycolmap
 from numpy.typing import NDArray
 
 from wheretolook.dataset.config import CONTRADICTED, LOCALIZED, NO_POSE
@@ -24,7 +26,6 @@ from wheretolook.utils.files import path_ends, write_json, write_text
 from wheretolook.utils.texts import quiet_colmap
 
 if TYPE_CHECKING:
-    import pandas as pd
     from matplotlib.figure import Figure
 
 
@@ -126,8 +127,6 @@ def _has_proportions(camera: Camera, rgb: NDArray[np.uint8]) -> bool:
 
 def _fitted(name: str, rgb: NDArray[np.uint8], camera: Camera) -> QueryImage:
     """Reduce an image to the size of its camera and to 1,600 px, and return it with the camera of that size."""
-    import pycolmap
-
     reduced = reduce_photograph(rgb, min(1600, max(camera.width, camera.height)))
     height, width = reduced.shape[:2]
     if (width, height) != (camera.width, camera.height):
@@ -139,8 +138,6 @@ def _fitted(name: str, rgb: NDArray[np.uint8], camera: Camera) -> QueryImage:
 
 def _exif_focal_px(path: Path) -> float | None:
     """Read the focal length of a photograph in pixels from its EXIF data; None without."""
-    import pycolmap
-
     options = pycolmap.ImageReaderOptions(camera_model="SIMPLE_PINHOLE")
     try:
         with quiet_colmap():
@@ -250,8 +247,6 @@ class Localized:
 
     def table(self) -> pd.DataFrame:
         """Return a row for each image; NaN where there is no pose."""
-        import pandas as pd
-
         columns = (*"xyz", "yaw_deg", "pitch_deg", "qw", "qx", "qy", "qz", "deviation", "deviation_deg")
         values = np.full((len(self), len(columns)), np.nan)
         if self.cam_from_world is not None:
@@ -286,8 +281,6 @@ def check_localized_format(path: Path) -> str:
 
 def save_localized(results: Sequence[Localized], path: Path) -> None:
     """Write results to a file of the format of its name, atomically; images.txt has the localized ones only."""
-    import pandas as pd
-
     suffix = check_localized_format(path)
     if suffix == "csv":
         table = pd.concat([result.table() for result in results])

@@ -46,7 +46,7 @@ Markdown(showcase.summary())
 # offices, courts, and buildings with repeated rooms.
 
 # %%
-scorer = load_scorer(release.root / "weights", showcase.localization_map)
+scorer = load_scorer(showcase.localization_map, release.root / "weights")
 location = showcase.instructive_location()
 
 # %% [markdown]

@@ -49,7 +49,7 @@ location = showcase.instructive_location()
 # three coordinates in the camera frame. The distant kitchen stands out in *z*.
 
 # %%
-mlp = load_scorer(release.root / "weights" / "mlp-2d+z.safetensors", showcase.localization_map)
+mlp = load_scorer(showcase.localization_map, release.root / "weights" / "mlp-2d+z.safetensors")
 learning = learning_of(showcase, mlp, location)
 display(inputs_figure(learning.image))
 

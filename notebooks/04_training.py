@@ -124,7 +124,7 @@ location = showcase.instructive_location()
 # dim corner. Below each view is its pose error, if a pose was estimated.
 
 # %%
-mlp = load_scorer(release.root / "weights" / "mlp-2d+z.safetensors", showcase.localization_map)
+mlp = load_scorer(showcase.localization_map, release.root / "weights" / "mlp-2d+z.safetensors")
 display(peaks_figure(*peaks_of(showcase, mlp, location)))
 
 # %% [markdown]
@@ -135,7 +135,7 @@ display(peaks_figure(*peaks_of(showcase, mlp, location)))
 # network scores highly, yet the views do not localize.
 
 # %%
-scorer = load_scorer(release.root / "weights", showcase.localization_map)
+scorer = load_scorer(showcase.localization_map, release.root / "weights")
 display(peaks_figure(*peaks_of(showcase, scorer, location)))
 
 # %% [markdown]

@@ -88,7 +88,7 @@ places = np.random.default_rng(3).choice(free[abs(free[:, 2] - 1.3) < 0.5], 20, 
 # view comes first.
 
 # %%
-scorer = load_scorer(open_release().root / "weights", localization_map)
+scorer = load_scorer(localization_map, open_release().root / "weights")
 directions = fibonacci_sphere(100)
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from wheretolook.commands.demo import Demo
-from wheretolook.commands.map import Map
+from wheretolook.commands.map import BuildMap
 from wheretolook.commands.options import select_options
 from wheretolook.planning.config import PlanConfig, ViewpointMapConfig
 
@@ -23,5 +23,5 @@ class AllOptions(Demo):
 
 def run(command, options, log=lambda line: None):
     """Run a command with those of the options that it has."""
-    given = options.source if command is Map else {}
+    given = options.source if command is BuildMap else {}
     return select_options(command, options, **given).run(log)

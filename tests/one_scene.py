@@ -1,6 +1,6 @@
 """Labels the viewpoints of one scene, as `wheretolook.localization.labeller.label_scenes` does those of many."""
 
-from wheretolook.features.config import ExtractorConfig
+from wheretolook.features.extractor import ExtractorConfig
 from wheretolook.localization.config import LabelConfig
 from wheretolook.localization.labeller import LabelTask, label_scenes
 from wheretolook.localization.shard import SceneJob

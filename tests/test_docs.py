@@ -17,14 +17,16 @@ import pandas as pd
 import pytest
 import yaml
 
+import wheretolook
 from box_scenes import furnished_room
 from selection.room import write_room
-from wheretolook.cli import command_options, command_targets, load_command, main, parse_command
+from wheretolook.cli import COMMANDS, command_options, command_targets, load_command, main, parse_command
 from wheretolook.dataset.layout import Dataset
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.mapping.colmap_model import colmap_poses
 from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.scenes.loading import save_glb
+from wheretolook.utils import errors
 from wheretolook_paper.figures.photograph_paths import photograph_paths_markdown, read_photograph_paths
 from wheretolook_paper.release.numbers import Numbers, pages, updated
 
@@ -221,3 +223,29 @@ def dotted(settings: dict[str, object], prefix: str = "") -> Iterator[str]:
         yield f"{prefix}{key}"
         if isinstance(value, dict):
             yield from dotted(value, f"{prefix}{key}.")
+
+
+# --- the public names
+
+
+def test_the_page_of_the_interface_lists_what_is_public() -> None:
+    documented = set()
+    commands = set()
+    for name, options in re.findall(
+        r"^::: ([\w.]+)\n((?:    .*\n)*)", (ROOT / "docs" / "api.md").read_text() + "\n", re.M
+    ):
+        members = re.search(r"members: \[(.*)\]", options)
+        if name == "wheretolook.utils.errors":
+            documented |= {
+                known
+                for known, value in vars(errors).items()
+                if isinstance(value, type) and issubclass(value, Exception)
+            }
+        elif name.startswith("wheretolook.commands."):
+            commands.add(name)
+        else:
+            documented |= set(members[1].split(", ")) if members else {name.rpartition(".")[2]}
+    assert documented == set(wheretolook.__all__) - {"__version__"}
+    assert commands == {target.replace(":", ".") for target in COMMANDS.values()}
+    home = {name: getattr(wheretolook, name).__module__ for name in documented}
+    assert all(home[name] == wheretolook._HOMES[name] for name in documented), home

@@ -63,12 +63,9 @@ def test_a_map_is_scored_by_the_weights_that_ship(localization_map: Localization
     views = poses_looking_along(rng.uniform((-1, -1, 1), (1, 1, 2), (20, 3)), rng.normal(size=(20, 3)))
     scorer = load_scorer(localization_map)
     assert scorer.name == "set"
-    expected = load_scorer(ROOT / WEIGHTS / "set.safetensors", localization_map).score(views)
-    for same in (scorer, load_scorer(None, localization_map), load_scorer(WEIGHTS, localization_map)):
+    expected = load_scorer(localization_map, ROOT / WEIGHTS / "set.safetensors").score(views)
+    for same in (scorer, load_scorer(localization_map, WEIGHTS)):
         np.testing.assert_array_equal(same.score(views), expected)
-    assert load_scorer(localization_map=localization_map).name == "set"
-    with pytest.raises(ConfigError, match="needs a map"):
-        load_scorer(WEIGHTS)  # type: ignore[call-overload]
 
 
 def test_public_names_are_there_and_cost_nothing_until_they_are_used() -> None:

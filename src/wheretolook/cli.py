@@ -27,7 +27,7 @@ from wheretolook.utils.texts import quiet_libraries
 
 COMMANDS = {
     "scenes": "wheretolook.commands.scenes:Scenes",
-    "map": "wheretolook.commands.map:Map",
+    "map": "wheretolook.commands.map:BuildMap",
     "sample": "wheretolook.commands.sample:Sample",
     "label": "wheretolook.commands.label:Label",
     "train": "wheretolook.commands.train:Train",

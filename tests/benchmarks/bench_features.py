@@ -25,8 +25,7 @@ from sklearn.metrics import roc_auc_score
 from tqdm.auto import tqdm
 
 from wheretolook.dataset.viewpoint_table import LOCALIZED
-from wheretolook.features.config import ExtractorConfig, KeypointExtractor
-from wheretolook.features.extractor import Keypoints
+from wheretolook.features.extractor import ExtractorConfig, KeypointExtractor, Keypoints
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import pose_error, poses_looking_along
 from wheretolook.inputs.localization_map import LocalizationMap

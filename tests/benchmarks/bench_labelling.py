@@ -22,7 +22,7 @@ from common import free_points, open_scene, use_one_thread
 from wheretolook.commands.options import extractor_of
 from wheretolook.dataset.layout import SceneFolder
 from wheretolook.dataset.viewpoint_table import poses
-from wheretolook.features import aliked_batch
+from wheretolook.features import learned
 from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.localization.config import LocalizerConfig
 from wheretolook.localization.localizer import Localizer
@@ -69,9 +69,9 @@ def time_steps(folder: SceneFolder, views: np.ndarray, batch: int, device: str, 
     for warm_up in (True, False):
         watch = Stopwatch(device)
         if not warm_up and hasattr(network, "dkd"):
-            watch.time_method(aliked_batch, "_maps", "of it network")
-            watch.time_method(aliked_batch, "_detected", "detection")
-            watch.time_method(aliked_batch, "_described", "description")
+            watch.time_method(learned, "_maps", "of it network")
+            watch.time_method(learned, "_detected", "detection")
+            watch.time_method(learned, "_described", "description")
         for start in range(0, min(len(views), 2 * batch) if warm_up else len(views), batch):
             with watch("render"):
                 rgb = renderer.render(camera, views[start : start + batch]).rgb

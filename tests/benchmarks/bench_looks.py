@@ -36,7 +36,7 @@ def main() -> None:
     torch.set_num_threads(1)
     scene = SceneFolder(options.scene, "test")
     localization_map = scene.localization_map()
-    scorer = load_scorer(str(shipped(WEIGHTS) / "set.safetensors"), localization_map)
+    scorer = load_scorer(localization_map, str(shipped(WEIGHTS) / "set.safetensors"))
     places = np.unique(np.round(camera_centers(poses(read_table(scene.table))), 9), axis=0)[: options.places]
     directions = direction_lattice(options.directions)
     scores = scorer.score_directions(places, directions)

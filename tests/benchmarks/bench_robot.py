@@ -69,7 +69,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         export_robot(localization_map, args.weights, folder)
         robot = RobotScorer(folder)
-        scorer = load_scorer(args.weights, localization_map)
+        scorer = load_scorer(localization_map, args.weights)
         views = robot.views(poses)
         off = np.abs(views.score - scorer.score(poses)).max()
         seen = f"{np.median(views.n_visible):.0f} in view (up to {views.n_visible.max()})"

@@ -73,7 +73,7 @@ def scoring(landmarks: Landmarks, room: np.ndarray, count: int) -> Callable[[], 
     chosen = rng.integers(0, room.max() + 1, count)
     locations = room_offset(chosen) + rng.uniform(*ROOM_M, (count, 3)) * (0.5, 0.5, 1)
     occlusion = StoredOcclusion.from_mask(locations, room == chosen[:, None])
-    scorer = load_scorer(None, LocalizationMap(Map(landmarks), PinholeCamera(), occlusion, "cpu"))
+    scorer = load_scorer(LocalizationMap(Map(landmarks), PinholeCamera(), occlusion, "cpu"))
     axes = fibonacci_sphere(500)
     return lambda: scorer.score_directions(locations, axes)
 

@@ -58,7 +58,7 @@ def main() -> None:
     scorers: dict[str, Scorer] = {"bins": make_scorer("bins", localization_map)}
     for path in args.weights:
         try:
-            scorers[path.stem] = load_scorer(path, localization_map)
+            scorers[path.stem] = load_scorer(localization_map, path)
         except WhereToLookError as error:  # matchability is no scorer by itself
             print(f"{path.stem}: {error}")
     if args.step:

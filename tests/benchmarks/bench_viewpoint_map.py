@@ -21,9 +21,9 @@ from common import points_on_surface, room_map, timed
 from wheretolook.geometry.lattices import VoxelGrid, fibonacci_sphere
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.map import Map
-from wheretolook.planning.routes import TurnLimit, best_sequence
 from wheretolook.planning.scene_map import build_viewpoint_map
 from wheretolook.planning.stops import refine_directions
+from wheretolook.planning.view_sequence import TurnLimit, best_sequence
 from wheretolook.planning.viewpoint_map import ViewpointMap
 from wheretolook.rendering.raycasting import MeshRaycaster
 from wheretolook.scenes.config import ApartmentConfig
@@ -98,7 +98,7 @@ def main() -> None:
     directions = fibonacci_sphere(args.directions)
 
     mapped = LocalizationMap(Map(landmarks), room.camera, occlusion, args.device)
-    scorer = load_scorer(args.weights, mapped) if args.weights else make_scorer("bins", mapped)
+    scorer = load_scorer(mapped, args.weights) if args.weights else make_scorer("bins", mapped)
     print(f"{len(free)} voxels x {len(directions)} directions, {len(landmarks):,} landmarks, "
           f"{len(mesh.triangles):,} triangles, {scorer.name}, on {args.device}, "
           f"{cores()} cores")  # fmt: skip

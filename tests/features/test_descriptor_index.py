@@ -14,14 +14,13 @@ def stored(values):
     return np.round(512 * positive / np.linalg.norm(positive, axis=1, keepdims=True)).astype(np.uint8)
 
 
-def test_the_index_finds_what_the_exact_search_finds(monkeypatch):
+def test_the_index_finds_what_the_exact_search_finds():
     pytest.importorskip("faiss")
-    monkeypatch.setattr(descriptor_index, "_LISTS", 64)
     rng = np.random.default_rng(0)
     kinds = rng.normal(size=(200, 128)) ** 3  # landmarks are of 200 kinds that look alike
     landmarks = stored(kinds[rng.integers(0, 200, 8000)] + 0.6 * rng.normal(size=(8000, 128)))
     queries = stored(landmarks[:500] + rng.normal(0, 8, (500, 128)))
-    index, exact = DescriptorIndex(landmarks), DescriptorMatcher(landmarks)
+    index, exact = DescriptorIndex(landmarks, lists=64), DescriptorMatcher(landmarks)
     rows, squared = index.nearest(queries, MAX_NEAREST)
     true_rows, _ = exact.nearest(queries, MAX_NEAREST)
     assert rows.shape == squared.shape == (500, MAX_NEAREST) and (np.diff(squared) >= 0).all()

@@ -5,8 +5,7 @@ import pycolmap
 import pytest
 
 from features.textures import color_texture
-from wheretolook.features.config import ExtractorConfig, KeypointExtractor
-from wheretolook.features.extractor import quantize_descriptors, unit_descriptors
+from wheretolook.features.extractor import ExtractorConfig, KeypointExtractor, quantize_descriptors, unit_descriptors
 from wheretolook.utils.processes import WorkerPool
 
 METHODS = ("colmap", "opencv")

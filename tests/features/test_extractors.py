@@ -6,11 +6,9 @@ import numpy as np
 import pytest
 
 from twins.features import mutual_matches
-from wheretolook.features.aliked_batch import detect_and_describe
-from wheretolook.features.config import ExtractorConfig, KeypointExtractor
-from wheretolook.features.extractor import unit_descriptors
+from wheretolook.features.extractor import KINDS, ExtractorConfig, KeypointExtractor, kind_of, unit_descriptors
+from wheretolook.features.learned import detect_and_describe
 from wheretolook.features.matching import SimilarityMatcher
-from wheretolook.features.registry import all_kinds, kind_of
 from wheretolook.localization.config import LocalizerConfig
 from wheretolook.utils.errors import WeightsError
 
@@ -21,7 +19,7 @@ def unit(n, dimension, seed=0):
     return unit_descriptors(np.random.default_rng(seed).normal(size=(n, dimension)))
 
 
-@pytest.mark.parametrize("kind", all_kinds().values(), ids=lambda kind: kind.name)
+@pytest.mark.parametrize("kind", KINDS.values(), ids=lambda kind: kind.name)
 def test_stored_descriptors_come_back_as_they_were_stored(kind):
     values = unit(50, kind.dimension)
     stored = kind.store(np.abs(values) if kind.in_bytes else values)

@@ -6,7 +6,7 @@ import warp as wp
 from scipy.spatial import KDTree
 
 from features.textures import texture
-from wheretolook.features.config import ExtractorConfig, KeypointExtractor
+from wheretolook.features.extractor import ExtractorConfig, KeypointExtractor
 from wheretolook.features.warp_sift import WarpSift
 
 EVERYTHING = ExtractorConfig(max_keypoints=100_000)

@@ -3,7 +3,7 @@
 import numpy as np
 import pycolmap
 
-from wheretolook.features.sift import SIFT
+from wheretolook.features.extractor import SIFT
 from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.mapping.triangulation import fill_database
 

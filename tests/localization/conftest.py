@@ -1,5 +1,7 @@
 """One room for all tests of labelling, and its labels from a plain loop in this process."""
 
+from dataclasses import replace
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -29,7 +31,7 @@ def views():
 def expected(room, views, tmp_path_factory):
     """The file of their labels that every engine must produce."""
     localizer = Localizer(Landmarks.load(room.landmarks), CAMERA)
-    labelled = label_rows(views, WarpRenderer(load_mesh(room.mesh)), localizer, CAMERA)
+    labelled = label_rows(views, room.job, localizer, WarpRenderer(load_mesh(room.mesh)))
     assert labelled["status"].nunique() > 1
     return file_bytes(labelled, tmp_path_factory.mktemp("expected"))
 
@@ -38,7 +40,7 @@ def expected(room, views, tmp_path_factory):
 def matched(room, views):
     """Their labels with the landmarks that were matched."""
     localizer = Localizer(Landmarks.load(room.landmarks), CAMERA)
-    return label_rows(views, WarpRenderer(load_mesh(room.mesh)), localizer, CAMERA, store_matches=True)
+    return label_rows(views, replace(room.job, store_matches=True), localizer, WarpRenderer(load_mesh(room.mesh)))
 
 
 @pytest.fixture(scope="session")

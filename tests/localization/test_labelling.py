@@ -59,7 +59,7 @@ def test_batches_that_exceed_the_memory_are_halved(room, views, expected, tmp_pa
 
     localizer.extractor.extract_batch = extract_batch
     with caplog.at_level("WARNING"):
-        labelled = label_rows(views, SmallRenderer(load_mesh(room.mesh)), localizer, CAMERA)
+        labelled = label_rows(views, room.job, localizer, SmallRenderer(load_mesh(room.mesh)))
     assert file_bytes(labelled, tmp_path / "halved") == expected
     assert "GPU memory does not suffice" in caplog.text
 
@@ -68,7 +68,7 @@ def test_batches_that_exceed_the_memory_are_halved(room, views, expected, tmp_pa
 
     localizer.extractor.extract_batch = broken
     with pytest.raises(RuntimeError, match="another error"):
-        label_rows(views, WarpRenderer(load_mesh(room.mesh)), localizer, CAMERA)
+        label_rows(views, room.job, localizer, WarpRenderer(load_mesh(room.mesh)))
 
 
 @pytest.mark.slow
@@ -89,7 +89,7 @@ def test_several_hypotheses_also_label_by_the_first_ransac_result(room, views, t
     renderer = WarpRenderer(load_mesh(room.mesh))
     landmarks = Landmarks.load(room.landmarks)
     first, both = (
-        label_rows(views, renderer, Localizer(landmarks, CAMERA, LocalizerConfig(method)), CAMERA)
+        label_rows(views, room.job, Localizer(landmarks, CAMERA, LocalizerConfig(method)), renderer)
         for method in ("first", "hypotheses")
     )
     pd.testing.assert_frame_equal(by_first(both)[[*first]], first)
@@ -99,7 +99,7 @@ def test_several_hypotheses_also_label_by_the_first_ransac_result(room, views, t
         stored = read_table(tmp_path / "both.parquet")
         assert [*stored] == [*SCHEMA.names, *FIRST_FIELDS.names]
         pd.testing.assert_frame_equal(by_first(stored)[["status", "error_m"]], first[["status", "error_m"]])
-    assert [*label_rows(stored, renderer, Localizer(landmarks, CAMERA), CAMERA)] == SCHEMA.names
+    assert [*label_rows(stored, room.job, Localizer(landmarks, CAMERA), renderer)] == SCHEMA.names
 
 
 def test_errors_are_measured_against_the_true_pose(room):
@@ -115,7 +115,7 @@ def test_errors_are_measured_against_the_true_pose(room):
             moved[:, :, 3] += [0.0, 0.1, 0.0]  # 10 cm along the camera's y
             return super().render(camera, yaw @ moved)
 
-    labelled = label_rows(table, Elsewhere(load_mesh(room.mesh)), localizer, CAMERA)
+    labelled = label_rows(table, room.job, localizer, Elsewhere(load_mesh(room.mesh)))
     np.testing.assert_allclose(labelled["error_m"], 0.1, atol=0.02)
     np.testing.assert_allclose(labelled["error_deg"], 3.0, atol=0.2)
 
@@ -152,11 +152,13 @@ def test_views_of_several_cameras_are_labelled_as_each_alone(room):
     table = facing(POSTER, 8, distance_m=1.5).assign(camera_id=np.array([4, 9, 9, 4, 4, 4, 9, 4], np.int32))
     renderer = WarpRenderer(load_mesh(room.mesh))
     localizer = Localizer(Landmarks.load(room.landmarks), CAMERA)
-    labelled = label_rows(table, renderer, localizer, cameras)
+    labelled = label_rows(table, replace(room.job, cameras=tuple(cameras.items())), localizer, renderer)
     assert is_good(labelled).all() and labelled["viewpoint_id"].equals(table["viewpoint_id"])
     for number, camera in cameras.items():
         rows = table["camera_id"] == number
-        alone = label_rows(table[rows], renderer, Localizer(localizer.landmarks, camera), camera)
+        alone = label_rows(
+            table[rows], replace(room.job, camera=camera), Localizer(localizer.landmarks, camera), renderer
+        )
         pd.testing.assert_frame_equal(labelled[rows], alone)
 
 
@@ -198,9 +200,9 @@ def test_half_of_the_locations_show_the_changed_mesh(room, tmp_path):
     assert (labelled.groupby("location_id")["changes"].nunique() == 1).all()
     assert is_good(labelled)[~is_changed].all() and (labelled["n_inliers"][is_changed] == 0).all()
     localizer = Localizer(Landmarks.load(room.landmarks), CAMERA)
-    alone = label_rows(table[~is_changed], WarpRenderer(mesh), localizer, CAMERA)
+    alone = label_rows(table[~is_changed], room.job, localizer, WarpRenderer(mesh))
     pd.testing.assert_frame_equal(labelled[~is_changed].drop(columns="changes"), alone, check_dtype=False)
-    again = label_rows(labelled, WarpRenderer(mesh), localizer, CAMERA)
+    again = label_rows(labelled, room.job, localizer, WarpRenderer(mesh))
     assert "changes" not in again and is_good(again).all()
 
 

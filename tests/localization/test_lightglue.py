@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from holdout.corridor import write_corridor
-from wheretolook.features.extractor import Keypoints
-from wheretolook.features.registry import all_kinds
+from wheretolook.features.extractor import KINDS, Keypoints
 from wheretolook.geometry.camera import cameras_by_id
 from wheretolook.geometry.poses import pose_error
 from wheretolook.holdout.holdout import choose_blocks, hold_out_blocks
@@ -20,7 +19,7 @@ from wheretolook.mapping.feature_files import read_features
 from wheretolook.mapping.landmarks import load_colmap_landmarks
 from wheretolook.utils.errors import MapError, WeightsError
 
-KIND = all_kinds()["aliked"]
+KIND = KINDS["aliked"]
 
 
 def nearest_neighbour_weights(path):

@@ -1,6 +1,7 @@
 """Matched landmarks stored with the labels: their rows, and that nothing else changes."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
@@ -9,7 +10,7 @@ import pytest
 from localization.rooms import CAMERA, PLAIN, POSTER, facing, file_bytes, label, times
 from wheretolook.dataset.viewpoint_files import MATCH_FIELDS, SCHEMA, read_table, write_table
 from wheretolook.dataset.viewpoint_table import TOO_FEW_MATCHES, is_good, poses
-from wheretolook.features.config import ExtractorConfig
+from wheretolook.features.extractor import ExtractorConfig
 from wheretolook.geometry.poses import transform
 from wheretolook.localization.config import LocalizerConfig, versions
 from wheretolook.localization.labeller import MANIFEST
@@ -74,7 +75,7 @@ def test_pixels_are_kept_in_the_order_of_the_landmarks(room, views, matched, tmp
     localizer = Localizer(landmarks, CAMERA)
     renderer = WarpRenderer(load_mesh(room.mesh))
     some = views.iloc[rows].reset_index(drop=True)
-    kept = label_rows(some, renderer, localizer, CAMERA, store_pixels=True)
+    kept = label_rows(some, replace(room.job, store_pixels=True), localizer, renderer)
     write_table(kept, tmp_path / "viewpoints.parquet")
     back = read_table(tmp_path / "viewpoints.parquet", pixels=True)
     assert "matched_pixels" not in read_table(tmp_path / "viewpoints.parquet", matches=True)

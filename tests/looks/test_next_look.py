@@ -19,7 +19,7 @@ FIRST = poses_looking_along(CENTER[None], [(1.0, 0.2, 0.1)])[0]
 
 @pytest.fixture(scope="module")
 def scorer(tmp_path_factory):
-    return load_scorer(WEIGHTS, LocalizationMap.from_colmap(write_room(tmp_path_factory.mktemp("room") / "sparse")))
+    return load_scorer(LocalizationMap.from_colmap(write_room(tmp_path_factory.mktemp("room") / "sparse")), WEIGHTS)
 
 
 @pytest.fixture(scope="module")

@@ -32,7 +32,7 @@ MODEL = SetScoreModel.bundled()
 
 @pytest.fixture(scope="module")
 def scorer(tmp_path_factory):
-    return load_scorer(WEIGHTS, LocalizationMap.from_colmap(write_room(tmp_path_factory.mktemp("room") / "sparse")))
+    return load_scorer(LocalizationMap.from_colmap(write_room(tmp_path_factory.mktemp("room") / "sparse")), WEIGHTS)
 
 
 @pytest.fixture(scope="module")

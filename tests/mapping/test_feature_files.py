@@ -8,7 +8,7 @@ import pytest
 
 from mapping.test_landmarks import hand_written_model, random_descriptors, write_database
 from mapping.test_learned_features import database_of, hdf5_of, unit
-from wheretolook.features.registry import all_kinds
+from wheretolook.features.extractor import KINDS
 from wheretolook.mapping.colmap_model import model_arrays
 from wheretolook.mapping.feature_files import read_descriptors, read_features
 from wheretolook.utils.errors import MapError
@@ -16,7 +16,7 @@ from wheretolook.utils.errors import MapError
 MODEL, KEYPOINTS = hand_written_model()
 ARRAYS = model_arrays(MODEL)
 DESCRIPTORS = random_descriptors([len(pixels) for pixels in KEYPOINTS])
-ALIKED = all_kinds()["aliked"]
+ALIKED = KINDS["aliked"]
 LEARNED = [ALIKED.store(unit(len(pixels), ALIKED.dimension, seed)) for seed, pixels in enumerate(KEYPOINTS)]
 N = len(KEYPOINTS[0])
 COUNT = "WITH RECURSIVE c(x) AS (SELECT 1 UNION ALL SELECT x + 1 FROM c) SELECT"  # without end

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from wheretolook.commands.map import Map
+from wheretolook.commands.map import BuildMap
 from wheretolook.geometry.camera import CameraConfig
 from wheretolook.mapping.config import FrameOptions, ImportConfig, MapConfig, MarkerConfig, PhotographsConfig
 from wheretolook.mapping.georeference import (
@@ -139,17 +139,17 @@ def test_invalid_settings_are_rejected():
     with pytest.raises(ConfigError):
         ImportConfig(model=Path("model"), scale=sized, frame=FrameOptions(scale=2))
     with pytest.raises(ConfigError):
-        Map(up="level")
+        BuildMap(up="level")
 
 
 @pytest.mark.parametrize("source", [{"photographs": PhotographsConfig(Path("photos"))}, {"model": Path("model")}])
 def test_options_of_renders_are_rejected_by_name_for_other_maps(source):
     of_renders = {"camera": CameraConfig(), "draw_camera": True, "vary": True, "appearance": 0.4, "keep_images": True}
-    Map(**source, mapping=MapConfig(keep_database=True))
+    BuildMap(**source, mapping=MapConfig(keep_database=True))
     for name, value in of_renders.items():
-        Map(mapping=MapConfig(**{name: value}))
+        BuildMap(mapping=MapConfig(**{name: value}))
         with pytest.raises(ConfigError, match=rf"photographs or a model.*'mapping\.{name}'"):
-            Map(**source, mapping=MapConfig(**{name: value}))
+            BuildMap(**source, mapping=MapConfig(**{name: value}))
 
 
 def test_a_mislabelled_position_of_many_is_left_out(caplog):

@@ -7,8 +7,7 @@ import pytest
 
 from mapping.test_landmarks import hand_written_model
 from mapping.test_own_models import written
-from wheretolook.features.extractor import unit_descriptors
-from wheretolook.features.registry import all_kinds
+from wheretolook.features.extractor import KINDS, unit_descriptors
 from wheretolook.mapping.colmap_model import model_arrays
 from wheretolook.mapping.feature_files import read_features
 from wheretolook.mapping.landmarks import Landmarks, load_colmap_landmarks, read_feature_name
@@ -16,7 +15,7 @@ from wheretolook.mapping.triangulation import fill_database, match_pairs
 from wheretolook.utils.errors import MapError, MapWarning
 from wheretolook.utils.processes import WorkerPool
 
-LEARNED = [kind for kind in all_kinds().values() if not kind.in_bytes]
+LEARNED = [kind for kind in KINDS.values() if not kind.in_bytes]
 
 
 def unit(n, dimension, seed=0):
@@ -90,7 +89,7 @@ def test_learned_descriptors_are_read_and_averaged(tmp_path, kind, source):
 def test_a_database_is_read_as_colmap_4_reads_it(tmp_path):
     import pycolmap
 
-    kind = all_kinds()["aliked"]
+    kind = KINDS["aliked"]
     model, _, keypoints, stored = case(tmp_path, kind)
     with pycolmap.Database.open(str(database_of(tmp_path / "a.db", model, keypoints, stored, kind))) as database:
         read = database.read_descriptors(1)
@@ -101,9 +100,9 @@ def test_a_database_is_read_as_colmap_4_reads_it(tmp_path):
 def test_the_number_of_columns_decides_the_kind_where_nothing_states_it(tmp_path):
     for name in ("xfeat", "superpoint"):  # the only kinds of 64 and of 256 numbers
         (tmp_path / name).mkdir()
-        _, folder, keypoints, stored = case(tmp_path / name, all_kinds()[name])
+        _, folder, keypoints, stored = case(tmp_path / name, KINDS[name])
         assert load_colmap_landmarks(folder, hdf5_of(tmp_path / name / "f.h5", keypoints, stored)).features == name
-    _, folder, keypoints, stored = case(tmp_path, all_kinds()["disk"])  # or ALIKED
+    _, folder, keypoints, stored = case(tmp_path, KINDS["disk"])  # or ALIKED
     with pytest.warns(MapWarning):
         assert load_colmap_landmarks(folder, hdf5_of(tmp_path / "f.h5", keypoints, stored)).features == ""
 
@@ -111,7 +110,7 @@ def test_the_number_of_columns_decides_the_kind_where_nothing_states_it(tmp_path
 @pytest.mark.parametrize("factor", [1.0, 6.0])  # of 640 x 480 pixels
 def test_hdf5_in_half_precision_fits_the_model_that_hloc_made_from_it(tmp_path, factor):
     """hloc keeps pixels as half_precision, and adds half a pixel as half_precision when it writes them into COLMAP's database."""
-    kind = all_kinds()["superpoint"]
+    kind = KINDS["superpoint"]
     model, keypoints = hand_written_model()
     stored = [kind.store(unit(len(found), kind.dimension, seed)) for seed, found in enumerate(keypoints)]
     half_precision = []
@@ -133,7 +132,7 @@ def test_hdf5_in_half_precision_fits_the_model_that_hloc_made_from_it(tmp_path, 
 
 
 def test_pairs_of_images_are_matched_by_similarity(tmp_path):
-    kind = all_kinds()["xfeat"]
+    kind = KINDS["xfeat"]
     shared = unit(40, 64)
     pixels = np.zeros((60, 2), np.float32)
     images = [(pixels, kind.store(np.concatenate([shared, unit(20, 64, seed)]))) for seed in (1, 2, 3)]

@@ -12,7 +12,7 @@ import pytest
 from all_options import AllOptions, run
 from mapping.marker_rooms import CAMERA, MARKERS, hand_held_poses, marker_room, take_photographs
 from wheretolook.commands.label import Label
-from wheretolook.commands.map import Map
+from wheretolook.commands.map import BuildMap
 from wheretolook.commands.options import ScenesConfig
 from wheretolook.commands.sample import Sample
 from wheretolook.commands.viewpoint_map import BuildViewpointMap
@@ -159,7 +159,7 @@ def experiment(mapped, photographs, tmp_path_factory):
     )
     shutil.copytree(mapped[0] / "work", experiment.root / "room" / "photographs")
     said = []
-    run(Map, experiment, said.append)
+    run(BuildMap, experiment, said.append)
     assert any("scale unknown" in line for line in said) and any("photo-99.png" in line for line in said)
     return experiment
 
@@ -170,7 +170,7 @@ def test_a_scene_of_photographs_is_sampled_and_scored_but_not_labelled(experimen
     photographs = replace(experiment.source["photographs"], scale=scale)
     metric = replace(experiment, source={"photographs": photographs})
     said = []
-    run(Map, metric, said.append)
+    run(BuildMap, metric, said.append)
     assert any("scale: markers" in line for line in said)
     dataset = run(Sample, metric, said.append)
     assert any("occlusion by hidden-points" in line for line in said)
@@ -193,6 +193,6 @@ def test_a_scene_of_photographs_is_sampled_and_scored_but_not_labelled(experimen
     assert found.origin.occlusion == "hidden-points" and set(found.voxel_of_row) <= set(table["location_id"])
     best = found.best(camera_centers(views)[0])
     assert best is not None and best.n_visible > 0
-    run(Map, metric, said.append)
+    run(BuildMap, metric, said.append)
     run(Sample, metric, said.append)
     assert sum("reusing" in line for line in said) == 2

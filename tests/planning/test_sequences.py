@@ -9,7 +9,7 @@ import pytest
 
 from wheretolook.geometry.lattices import direction_lattice, yaw_pitch_angles
 from wheretolook.geometry.poses import Float, rotation_angle_deg, rotation_looking_along
-from wheretolook.planning.routes import TurnLimit, best_sequence
+from wheretolook.planning.view_sequence import TurnLimit, best_sequence
 from wheretolook.utils.errors import PlanningError
 
 

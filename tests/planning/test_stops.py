@@ -14,9 +14,10 @@ from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.map import Map
 from wheretolook.planning.config import PathConfig, StopConfig
-from wheretolook.planning.routes import PlannedPath, TurnLimit, best_sequence
+from wheretolook.planning.routes import PlannedPath
 from wheretolook.planning.scene_map import path_views
 from wheretolook.planning.stops import stops_along, within_pitch
+from wheretolook.planning.view_sequence import TurnLimit, best_sequence
 from wheretolook.scorers.base import Scorer
 from wheretolook.scorers.registry import make_scorer
 from wheretolook.utils.errors import ConfigError

@@ -56,7 +56,7 @@ def test_a_mesh_and_the_camera_of_the_robot(model: Path, tmp_path: Path) -> None
     assert np.isclose(distance[distance > 0].min(), 1) and (robot.places > 0).all()
     exact = LocalizationMap.from_colmap(model, mesh=mesh)
     views = poses_looking_along(robot.places, np.tile((-1.0, 0, -0.2), (len(robot.places), 1)))
-    expected = load_scorer(WEIGHTS, exact.of_camera(PinholeCamera(640, 480, 400.0, 410.0))).score(views)
+    expected = load_scorer(exact.of_camera(PinholeCamera(640, 480, 400.0, 410.0)), WEIGHTS).score(views)
     np.testing.assert_allclose(robot.score(views), expected, atol=1e-5, rtol=0)
 
 

@@ -16,8 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from synthetic_dataset import CAMERA, make_landmarks
 from wheretolook import load_scorer
-from wheretolook.features.config import ExtractorConfig
-from wheretolook.features.extractor import Keypoints, quantize_descriptors
+from wheretolook.features.extractor import ExtractorConfig, Keypoints, quantize_descriptors
 from wheretolook.features.matches import match
 from wheretolook.features.matching import DescriptorMatcher
 from wheretolook.features.sift import OpenCvSift

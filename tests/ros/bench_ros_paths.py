@@ -23,8 +23,8 @@ sys.path[:0] = [str(ROOT / "tests"), str(ROOT / "src" / "wheretolook_ros")]
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import Float, pan_tilt_angles, pose_error, poses_looking_along
 from wheretolook.planning.config import PathConfig
-from wheretolook.planning.routes import TurnLimit, best_sequence
 from wheretolook.planning.rrt import plan_path
+from wheretolook.planning.view_sequence import TurnLimit, best_sequence
 from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.robot.localizer import RobotLocalizer
 from wheretolook.robot.wheretolook_robot import RobotScorer, fibonacci_sphere

@@ -128,8 +128,19 @@ def test_compressed_images_of_12_bits_are_scaled_as_others() -> None:
     grey = np.random.default_rng(0).integers(0, 255, (48, 64), dtype=np.uint8)
     grey[0, 0] = 255
     png = cv2.imencode(".png", grey.astype(np.uint16) * 16 + 7)[1].tobytes()
-    scaled = grey_image(CompressedImage(format="mono16; png compressed", data=png))
+    scaled = grey_image(CompressedImage(format="mono16; png compressed", data=png), (64, 48))
     assert np.abs(scaled.astype(int) - grey).max() <= 1
+
+
+def test_a_compressed_image_that_would_fill_the_memory() -> None:
+    """Its size is read before it is decoded."""
+    png = cv2.imencode(".png", np.zeros((12_000, 12_000), np.uint8))[1].tobytes()
+    assert len(png) < 1_000_000
+    with pytest.raises(ValueError, match="12000 x 12000 px, but camera_info says 640 x 480"):
+        grey_image(CompressedImage(format="png", data=png), (640, 480))
+    hdr = b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 40000 +X 40000\n" + bytes(50)
+    with pytest.raises(ValueError, match="cannot decode"):
+        grey_image(CompressedImage(format="hdr", data=hdr), (640, 480))
 
 
 def test_16_bits_are_shifted_by_the_brightest_pixel() -> None:
@@ -139,8 +150,8 @@ def test_16_bits_are_shifted_by_the_brightest_pixel() -> None:
     for bits in (8, 10, 12, 14, 16):
         for kind in ("<u2", ">u2"):
             values = (grey.astype(np.uint16) << (bits - 8)).astype(kind)
-            np.testing.assert_array_equal(grey_image(image_of_16_bits(values)), grey)
-    assert grey_image(image_of_16_bits(np.full((480, 640), 3, "<u2"))).max() == 3
+            np.testing.assert_array_equal(grey_image(image_of_16_bits(values), (640, 480)), grey)
+    assert grey_image(image_of_16_bits(np.full((480, 640), 3, "<u2")), (640, 480)).max() == 3
 
 
 @pytest.mark.parametrize("size", [(320, 240), (1280, 960)])
@@ -243,6 +254,10 @@ def test_an_image_that_cannot_be_read(robot: Robot, change: dict[str, object], m
         ({"binning_x": 2}, "binning"),
         ({"roi": RegionOfInterest(width=320, height=240)}, "region of interest"),
         ({"k": [1e-9, 0.0, 0.0, 0.0, 1e-9, 0.0, 0.0, 0.0, 1.0]}, "focal length"),
+        ({"k": [320.0, 0.0, np.nan, 0.0, 320.0, 240.0, 0.0, 0.0, 1.0]}, "k has a number that is not finite"),
+        ({"d": [0.1, np.inf, 0.0, 0.0, 0.0]}, "d has a number that is not finite"),
+        ({"width": 0, "height": 0}, "camera_info says 0 x 0"),
+        ({"distortion_model": "plumb_bob", "d": [0.1] * 7}, "plumb_bob' has another number of coefficients than 7"),
     ],
 )
 def test_a_camera_that_cannot_be_used(robot: Robot, change: dict[str, object], message: str) -> None:

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from box_scenes import box_quads, quads_mesh, random_texture, random_triangles
+from wheretolook.geometry.mesh import cut_above
 from wheretolook.rendering.raycasting import MeshRaycaster
-from wheretolook.scenes.cutting import cut_above
 
 
 def areas(mesh):

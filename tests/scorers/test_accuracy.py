@@ -23,7 +23,7 @@ from wheretolook.mapping.colmap_model import write_model
 from wheretolook.mapping.map import Map
 from wheretolook.scorers.registry import find, make_scorer
 from wheretolook.scorers.set.accuracy import STATISTICS, AccuracyModel, LogError
-from wheretolook.scorers.set.network import ALL_STATISTICS
+from wheretolook.scorers.set.network import VIEW_STATISTICS
 from wheretolook.scorers.set.score import SetScorer
 from wheretolook.scorers.weights import load_scorer
 from wheretolook.select.where_to_look import WhereToLook
@@ -40,21 +40,21 @@ MODEL = AccuracyModel((1.0, 0.5), 0.2, (LogError((0.1, 0.2, -0.3), -4.0, 0.9), L
 def views(n=200):
     """Statistics as of views with few to many landmarks."""
     rng = np.random.default_rng(0)
-    statistics = np.zeros((n, len(ALL_STATISTICS)))
+    statistics = np.zeros((n, len(VIEW_STATISTICS)))
     for name, low, high in (
         ("log_visible", 0, 7),
         ("log_position_variance", -8, 8),
         ("log_orientation_variance", -8, 8),
         ("log_expected_cells", 0, 5),
     ):
-        statistics[:, ALL_STATISTICS.index(name)] = rng.uniform(low, high, n)
+        statistics[:, VIEW_STATISTICS.index(name)] = rng.uniform(low, high, n)
     return statistics
 
 
 def p_within(statistics, accuracy):
     """F of `MODEL` by SciPy's log-normal distribution."""
     visible, position, orientation, cells = (
-        statistics[:, ALL_STATISTICS.index(name)]
+        statistics[:, VIEW_STATISTICS.index(name)]
         for name in ("log_visible", "log_position_variance", "log_orientation_variance", "log_expected_cells")
     )
     median_m = np.exp(position / 2 + 0.1 * visible + 0.2 * orientation - 0.3 * cells - 4)
@@ -92,7 +92,7 @@ def test_it_rises_from_0_through_the_networks_own_probability_to_the_right_place
 def test_errors_and_limits_scale_with_the_unit():
     statistics = views()
     larger = statistics.copy()
-    larger[:, ALL_STATISTICS.index("log_position_variance")] += 2 * math.log(10)
+    larger[:, VIEW_STATISTICS.index("log_position_variance")] += 2 * math.log(10)
     assert MODEL.quantiles(larger, (0.5, 0.4)) == pytest.approx(MODEL.quantiles(statistics, ACCURACY))
     assert MODEL.expected_errors(larger) == pytest.approx(MODEL.expected_errors(statistics) * (10, 1))
     median_m = np.exp(MODEL.log_errors(statistics)[:, 0])
@@ -108,7 +108,7 @@ def test_the_fit_finds_the_model_that_errors_are_drawn_from(monkeypatch):
     # shrunk, so that no error at the right place exceeds its limits
     errors = np.exp(MODEL.log_errors(statistics) + noise - 12)
     errors[~place] = np.inf
-    table = pd.DataFrame(statistics, columns=ALL_STATISTICS).assign(
+    table = pd.DataFrame(statistics, columns=VIEW_STATISTICS).assign(
         own=own, scene="one", error_m=errors[:, 0], error_deg=errors[:, 1]
     )
     monkeypatch.setattr(fit_accuracy, "LEAST", (0.0, 0.0))

@@ -82,8 +82,8 @@ def place(tmp_path_factory):
 
 def test_a_file_of_adapted_weights_scores_as_it_says(place):
     localization_map, path = place
-    adapted = load_scorer(path, localization_map)
-    base = load_scorer(SET, localization_map)
+    adapted = load_scorer(localization_map, path)
+    base = load_scorer(localization_map, SET)
     locations = np.array([[0.0, 0, 1], [0.5, 0.5, 1]])
     directions = fibonacci_sphere(20)
     poses = poses_looking_along(np.repeat(locations, 20, axis=0), np.tile(directions, (2, 1)))
@@ -102,8 +102,8 @@ def test_they_are_refused_in_another_scene_unless_forced(place):
     moved = Landmarks(**{**landmarks.__dict__, "points": landmarks.points + np.array([0.5, 0, 0])})
     other = LocalizationMap(Map(moved), localization_map.camera)
     with pytest.raises(WeightsError):
-        load_scorer(path, other)
-    assert load_scorer(path, other, anywhere=True).name == "adapted"
+        load_scorer(other, path)
+    assert load_scorer(other, path, anywhere=True).name == "adapted"
 
 
 def test_weights_with_a_gaussian_process_are_refused_by_name(place):
@@ -113,5 +113,5 @@ def test_weights_with_a_gaussian_process_are_refused_by_name(place):
     process = {"kernel": {"length_m": 1.0, "sharpness": 4.0}, "support": 0}
     write_weights(older, "adapted", tensors, {**header, **process})
     with pytest.raises(WeightsError, match="adapt") as raised:
-        load_scorer(older, localization_map)
+        load_scorer(localization_map, older)
     assert raised.value.path == older

@@ -123,10 +123,10 @@ def test_damaged_weights(change, trained, dataset, tmp_path):
     localization_map = dataset.scenes[0].localization_map(CAMERA)
     save_file(tensors, path, metadata={METADATA_KEY: json.dumps(header | (change or {}))})
     with pytest.raises(WeightsError):
-        load_scorer(path, localization_map)
+        load_scorer(localization_map, path)
     path.write_bytes(whole.read_bytes()[:-7])
     with pytest.raises(WeightsError):
-        load_scorer(path, localization_map)
+        load_scorer(localization_map, path)
 
 
 def warnings_of(scorer, cam_from_world):
@@ -163,7 +163,7 @@ def test_matches_must_be_stored(tmp_path, tracking):
     ("config", "options"),
     [
         (SetConfig, {"hidden": ("colour",)}),
-        (SetConfig, {"pooled": -1}),
+        (SetConfig, {"landmark_loss": -1}),
         (SetConfig, {"epochs": 0}),
         (MatchabilityConfig, {"width": 0}),
         (MatchabilityConfig, {"enlarged": 0.5}),

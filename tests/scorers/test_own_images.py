@@ -157,11 +157,11 @@ def test_all_scorers_of_a_map_use_it(tmp_path):
     localization_map = observed_map(0.6)
     views = localization_map.mapping_poses
     assert views is not None
-    scorer = load_scorer(WEIGHTS / "set.safetensors", localization_map)
-    plain = load_scorer(WEIGHTS / "set.safetensors", with_images(localization_map, None))
+    scorer = load_scorer(localization_map, WEIGHTS / "set.safetensors")
+    plain = load_scorer(with_images(localization_map, None), WEIGHTS / "set.safetensors")
     before, after = (one.report(views).expected_inliers for one in (plain, scorer))
     assert (after[before > 1] > 1.1 * before[before > 1]).all()
-    load_scorer(WEIGHTS / "set.safetensors", localization_map.of_camera(NARROW))
+    load_scorer(localization_map.of_camera(NARROW), WEIGHTS / "set.safetensors")
     assert sum(isinstance(key, tuple) for key in localization_map.map.computed) == 1  # estimated once
     axes = views[:1, 2, :3]
     center = camera_centers(views[:1])

@@ -33,7 +33,7 @@ def test_the_offset_is_added_once_and_only_for_photographs(rendered, tmp_path):
         views = localization_map.mapping_poses
         assert views is not None
         plain, *others = (
-            load_scorer(tmp_path / f"{name}.safetensors", localization_map) for name in ("without", "with", "again")
+            load_scorer(localization_map, tmp_path / f"{name}.safetensors") for name in ("without", "with", "again")
         )
         for scorer in others:
             np.testing.assert_allclose(logit(scorer.score(views)) - logit(plain.score(views)), expected, atol=1e-6)

@@ -222,7 +222,7 @@ def test_an_attribute_that_maps_do_not_know_is_named(tmp_path):
         Map(make_landmarks(np.random.default_rng(0), 20)), replace(CAMERA, focal_px=80.0)
     )
     with pytest.raises(WeightsError):
-        load_scorer(tmp_path / "set.safetensors", localization_map)
+        load_scorer(localization_map, tmp_path / "set.safetensors")
     views = poses_looking_along(np.zeros((1, 3)), np.ones((1, 3)))
     assert make_scorer("visible", localization_map).score(views).shape == (1,)
 
@@ -243,7 +243,7 @@ def test_weights_of_many_cameras_come_before_those_of_one(tmp_path):
         path.with_suffix(".json").write_text(json.dumps(record))
         assert resolve_weights(path=tmp_path).stem == best
         if best == "set":
-            assert load_scorer(tmp_path, localization_map).name == "set"
+            assert load_scorer(localization_map, tmp_path).name == "set"
 
 
 NEW_ATTRIBUTE = """
@@ -263,7 +263,7 @@ rng = np.random.default_rng(1)
 views = poses_looking_along(rng.uniform((-1, -1, 1), (1, 1, 2), (40, 3)), rng.normal(size=(40, 3)))
 at = LocalizationMap(Map(make_landmarks(np.random.default_rng(0), 200)), CAMERA)
 wide = LocalizationMap(at.map, type(CAMERA)(640, 480, 320.0))
-scores = {name: load_scorer(weights / f"{name}.safetensors", wide).score(views) for name in ("set", "mlp-2d+z")}
+scores = {name: load_scorer(wide, weights / f"{name}.safetensors").score(views) for name in ("set", "mlp-2d+z")}
 scores["expected"] = make_scorer("expected-bins", wide, weights=weights / "matchability.safetensors").score(views)
 scores["n_attributes"] = np.array([len(MAP_ATTRIBUTES)])
 np.savez(out, **scores)

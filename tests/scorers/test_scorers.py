@@ -75,7 +75,7 @@ def weights_of(method, path, localization_map):
     elif method == "matchability":
         network = MatchabilityNetwork(NO_STATISTICS)
     else:
-        network = SetNetwork(NO_STATISTICS, pooled=2)
+        network = SetNetwork(NO_STATISTICS)
         if method == "adapted":
             network = AdaptedNetwork(network, 1.0, 0.0, 0)
     return save_network(path, method, network)
@@ -148,7 +148,7 @@ def test_random_scores_are_uniform_and_depend_on_the_seed(localization_map):
 
 
 def test_learned_scores_equal_the_network_by_hand(localization_map, views, weights):
-    scorer = load_scorer(weights, localization_map)
+    scorer = load_scorer(localization_map, weights)
     assert scorer.name == "mlp-2d+3d"
     binned = localization_map.bin_views(views)
     network = scorer.network
@@ -164,8 +164,8 @@ def test_learned_scores_equal_the_network_by_hand(localization_map, views, weigh
 
 def test_another_resolution_of_the_same_field_of_view_scores_the_same(localization_map, views, weights):
     double = PinholeCamera(2 * CAMERA.width, 2 * CAMERA.height, 2 * CAMERA.focal_px)
-    scores = load_scorer(weights, LocalizationMap(Map(localization_map.landmarks), double)).score(views)
-    np.testing.assert_allclose(scores, load_scorer(weights, localization_map).score(views), rtol=1e-5)
+    scores = load_scorer(LocalizationMap(Map(localization_map.landmarks), double), weights).score(views)
+    np.testing.assert_allclose(scores, load_scorer(localization_map, weights).score(views), rtol=1e-5)
 
 
 @pytest.mark.parametrize(

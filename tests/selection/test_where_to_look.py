@@ -30,7 +30,7 @@ AXES = direction_lattice(60)
 @pytest.fixture(scope="module")
 def scorer(sparse: Path) -> Scorer:
     """The way to score without the façade."""
-    return load_scorer(WEIGHTS, LocalizationMap.from_colmap(sparse, occlusion=HiddenPointRemoval()))
+    return load_scorer(LocalizationMap.from_colmap(sparse, occlusion=HiddenPointRemoval()), WEIGHTS)
 
 
 def all_scores(scorer: Scorer, points: np.ndarray) -> np.ndarray:
@@ -58,7 +58,7 @@ def test_best_views_are_those_of_the_scorer(look: WhereToLook, scorer: Scorer) -
 def test_all_directions_at_once_score_as_one_by_one(camera: ColmapCamera | None, tmp_path: Path) -> None:
     folder = write_room(tmp_path / "sparse", text=camera is None)
     localization_map = LocalizationMap.from_colmap(folder, camera, occlusion=HiddenPointRemoval())
-    scorer = load_scorer(WEIGHTS, localization_map)
+    scorer = load_scorer(localization_map, WEIGHTS)
     slow = all_scores(scorer, POINTS)
     fast = scorer.score_directions(POINTS, AXES)
     odds = [np.log(scores / (1 - scores)) for scores in (slow, fast)]
@@ -68,7 +68,7 @@ def test_all_directions_at_once_score_as_one_by_one(camera: ColmapCamera | None,
 
 def test_a_sample_of_the_landmarks_ranks_as_all(tmp_path: Path) -> None:
     localization_map = LocalizationMap.from_colmap(write_room(tmp_path / "sparse", n=6000))
-    scorer = load_scorer(WEIGHTS, localization_map)
+    scorer = load_scorer(localization_map, WEIGHTS)
     poses = poses_looking_along(np.repeat(POINTS, len(AXES), axis=0), np.tile(AXES, (len(POINTS), 1)))
     starts, _ = localization_map.in_view_on_device(poses)
     assert np.diff(starts).max() > 1500

@@ -48,7 +48,7 @@ def test_adapted_weights_have_a_lower_loss_and_are_logged(dataset: Dataset, caps
     good = is_good(table)
     losses = []
     for weights in (None, path):
-        probability = load_scorer(weights, localization_map).score(poses(table)).clip(1e-9, 1 - 1e-9)
+        probability = load_scorer(localization_map, weights).score(poses(table)).clip(1e-9, 1 - 1e-9)
         losses.append(-np.log(np.where(good, probability, 1 - probability)).mean())
     assert losses[1] < losses[0]
     training = read_training(path)
@@ -61,7 +61,7 @@ def test_adapted_weights_have_a_lower_loss_and_are_logged(dataset: Dataset, caps
 def test_weights_without_a_gain_are_not_kept(dataset: Dataset, capsys: pytest.CaptureFixture[str]) -> None:
     scene = dataset.scenes[1]
     table = scene.read_table()
-    scored = load_scorer(None, scene.localization_map(scene.camera)).score(poses(table))
+    scored = load_scorer(scene.localization_map(scene.camera)).score(poses(table))
     draws = np.random.default_rng(5).random(len(table))
     localized = draws < scored  # the scorer is right
     table["status"] = np.where(localized, "localized", "no_pose")

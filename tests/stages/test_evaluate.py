@@ -134,7 +134,7 @@ def test_learned_methods_are_calibrated_on_the_val_scenes(dataset: Dataset, tmp_
     assert table.loc[table["method"] != "mlp-2d+z", ["ece", "ece_scaled", "temperature"]].isna().all(axis=None)
     (scene,) = dataset.split("val")
     views = scene.read_table()
-    logits = logit(load_scorer(model.path, scene.localization_map(dataset.camera)).score(poses(views)))
+    logits = logit(load_scorer(scene.localization_map(dataset.camera), model.path).score(poses(views)))
     assert abs(np.mean((expit(logits / temperature) - is_good(views)) * logits)) < 1e-4  # the likelihood is greatest
     assert set(curves["n_val"]) == {14 * 16}
     assert curves.groupby("when")["n"].sum().tolist() == [2 * 14 * 16] * 2

@@ -16,7 +16,7 @@ from box_scenes import box_quads, quads_mesh, random_texture
 from mapping.marker_rooms import CAMERA, MARKERS, hand_held_poses, marker_room, take_photographs
 from wheretolook.cli import main
 from wheretolook.commands.label import Label
-from wheretolook.commands.map import Map
+from wheretolook.commands.map import BuildMap
 from wheretolook.commands.options import MapUseOptions, ScenesConfig, extractor_of, select_options
 from wheretolook.commands.plan import Plan
 from wheretolook.commands.sample import Sample
@@ -24,7 +24,7 @@ from wheretolook.commands.viewpoint_map import BuildViewpointMap
 from wheretolook.dataset.layout import Dataset, SceneFolder
 from wheretolook.dataset.sampling_config import SampleConfig
 from wheretolook.dataset.scene import Scene
-from wheretolook.features.config import ExtractorConfig
+from wheretolook.features.extractor import ExtractorConfig
 from wheretolook.geometry.camera import CameraConfig, PinholeCamera
 from wheretolook.geometry.poses import camera_centers, poses_looking_along
 from wheretolook.geometry.views import Views
@@ -104,7 +104,7 @@ def test_from_a_model_to_a_planned_path(tmp_path, with_mesh):
         save_glb(empty_room(), tmp_path / "scan.glb")
     experiment = experiment_of(folder, tmp_path / "data", mesh=tmp_path / "scan.glb" if with_mesh else None)
     said: list[str] = []
-    run(Map, experiment)
+    run(BuildMap, experiment)
     n_points = model.num_points3D()
     (scene,) = Dataset.load(tmp_path / "data" / "mine").scenes
     assert scene.name == "flat" and scene.camera == LOOKS and scene.own_camera
@@ -131,7 +131,7 @@ def test_from_a_model_to_a_planned_path(tmp_path, with_mesh):
     with pytest.raises(MapError if with_mesh else SceneError):
         run(Label, experiment)
 
-    run(Map, experiment, said.append)
+    run(BuildMap, experiment, said.append)
     run(Sample, experiment, said.append)
     assert sum("reusing" in line for line in said) == 2
 
@@ -173,7 +173,7 @@ def test_one_command_plans_a_path_in_the_folder_of_a_model(tmp_path, capsys, uni
 
 def test_a_scene_is_replaced_by_no_other_source(tmp_path):
     data = tmp_path / "data"
-    (scene,) = run(Map, experiment_of(save(room_model(), tmp_path / "flat"), data)).scenes
+    (scene,) = run(BuildMap, experiment_of(save(room_model(), tmp_path / "flat"), data)).scenes
     content = (scene.map / "points3D.bin").read_bytes()
     other = save(room_model(cameras=(OTHER,)), tmp_path / "other" / "flat")
     (tmp_path / "photos" / "flat").mkdir(parents=True)
@@ -184,28 +184,28 @@ def test_a_scene_is_replaced_by_no_other_source(tmp_path):
         experiment_of(scene.map, data, scene=scene.name),  # the scene's own map
     ):
         with pytest.raises(ConfigError, match=r"made from another source|would be replaced"):
-            run(Map, experiment)
+            run(BuildMap, experiment)
     assert (scene.map / "points3D.bin").read_bytes() == content
 
 
 def test_one_of_several_cameras_is_chosen(tmp_path):
     folder = save(room_model(cameras=(LOOKS, OTHER)), tmp_path / "flat")
     with pytest.raises((ConfigError, MapError)):
-        run(Map, experiment_of(folder, tmp_path / "data"))
-    (scene,) = run(Map, experiment_of(folder, tmp_path / "data", camera_id=2)).scenes
+        run(BuildMap, experiment_of(folder, tmp_path / "data"))
+    (scene,) = run(BuildMap, experiment_of(folder, tmp_path / "data", camera_id=2)).scenes
     assert scene.camera == OTHER
     sampled = select_options(Sample, experiment_of(folder, tmp_path / "sampled"))
     sampled = replace(sampled, name="mine", map=folder, scale=1, camera_id=2, mapping=MapUseOptions())
     assert sampled.run().scenes[0].camera == OTHER
     named = replace(experiment_of(folder, tmp_path / "data"), camera=CameraConfig(400, 300, fov_deg=80.0))
-    (scene,) = run(Map, named).scenes
+    (scene,) = run(BuildMap, named).scenes
     assert scene.camera == named.camera.camera and not scene.own_camera
     with pytest.raises(ConfigError):
         run(Sample, experiment_of(folder, tmp_path / "data"))
     # each model that joins the dataset keeps its own camera
     experiment = experiment_of(save(room_model(), tmp_path / "second"), tmp_path / "more")
-    run(Map, replace(experiment, source=experiment_of(folder, tmp_path / "more", camera_id=2).source))
-    scenes = run(Map, experiment).scenes
+    run(BuildMap, replace(experiment, source=experiment_of(folder, tmp_path / "more", camera_id=2).source))
+    scenes = run(BuildMap, experiment).scenes
     assert [(scene.name, scene.camera) for scene in scenes] == [("flat", OTHER), ("second", LOOKS)]
     run(Sample, experiment)
     assert all(len(scene.read_table()) for scene in scenes)

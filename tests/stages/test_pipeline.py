@@ -238,7 +238,7 @@ def test_three_lines_score_viewpoints_of_a_colmap_model(demo: Path) -> None:
     table = scene.read_table()
     localization_map = LocalizationMap.from_colmap(scene.map, PinholeCamera(320, 240, 160), mesh=scene.mesh)
     weights = demo / "data" / "tiny" / "weights" / "mlp-2d+3d.safetensors"
-    scores = load_scorer(weights, localization_map).score(poses(table))
+    scores = load_scorer(localization_map, weights).score(poses(table))
     assert scores.shape == (len(table),) and np.all((scores > 0) & (scores < 1)) and np.ptp(scores) > 0
     # the mesh's rays and the occlusion stored by the sample stage agree
     binned = scene.localization_map(PinholeCamera(320, 240, 160)).bin_views(poses(table))

@@ -232,4 +232,4 @@ def test_the_released_variant_trains_as_the_released_code(dataset: Dataset, stor
     assert released.metrics["epoch"] == 1  # the last, whichever was best
     assert load(ours.path).spec.layout == "in_place"
     localization_map = dataset.scenes[0].localization_map(dataset.camera)
-    assert load_scorer(released.path, localization_map).name == "mlp-released"
+    assert load_scorer(localization_map, released.path).name == "mlp-released"

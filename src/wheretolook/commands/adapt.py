@@ -356,7 +356,7 @@ def labelled_views(files: SceneFolder, scene: Scene, table: pd.DataFrame, weight
     log_odds = np.empty(len(table))
     for camera, rows in views_by_camera(files, table):
         own = scene.localization_map.of_camera(camera) if scene.map.has_photographs else None
-        scorer = load_scorer(weights, own or files.localization_map(camera, scene.device))
+        scorer = load_scorer(own or files.localization_map(camera, scene.device), weights)
         with warnings.catch_warnings():  # how accurate the weights are here is what is measured
             warnings.simplefilter("ignore", OutOfRangeWarning)
             log_odds[rows] = log_odds_of(scorer.score(cam_from_world[rows]))

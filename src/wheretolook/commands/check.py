@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from wheretolook.commands.options import LabelOptions, OcclusionOptions, ScorerOptions
 from wheretolook.dataset.config import LOCK, checked_accuracy
-from wheretolook.features.config import ExtractorConfig
+from wheretolook.features.extractor import ExtractorConfig
 from wheretolook.mapping.config import FrameOptions, place_name
 from wheretolook.utils.errors import MapError, check_range, reject
 from wheretolook.utils.processes import cores, hold

@@ -12,7 +12,7 @@ from tqdm.auto import tqdm
 
 from wheretolook.commands.evaluate import evaluate_methods, not_logged
 from wheretolook.commands.label import Label
-from wheretolook.commands.map import Map
+from wheretolook.commands.map import BuildMap
 from wheretolook.commands.options import Experiment, Log, Progress, load_dataset, select_options
 from wheretolook.commands.sample import Sample
 from wheretolook.commands.scenes import Scenes
@@ -62,7 +62,7 @@ class Demo(Experiment):
         cost = {name: seconds * (n_scenes if name in STAGES else 1) for name, seconds in SECONDS.items()}
         steps: dict[str, Callable[..., object]] = {
             "scenes": select_options(Scenes, self).run,
-            "map": select_options(Map, self).run,
+            "map": select_options(BuildMap, self).run,
             "sample": select_options(Sample, self).run,
             "label": select_options(Label, self).run,
             "train": select_options(Train, self).run,

@@ -89,7 +89,7 @@ class Export(CameraOptions, FrameOptions):
             from wheretolook.select.image_localizer import ImageLocalizer
 
             described = ImageLocalizer.open(self.map, self.database, self.frame_options()).landmarks
-            scorer = load_scorer(weights, source.of_camera(camera))
+            scorer = load_scorer(source.of_camera(camera), weights)
             if self.accuracy is not None:
                 scorer = scorer.at_accuracy(self.accuracy)
             export_localizer(described, source.landmarks.ids, mean_scores_by_pitch(scorer), self.out)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 from wheretolook.commands.options import CameraOptions
 from wheretolook.dataset.config import checked_accuracy
-from wheretolook.features.config import ExtractorConfig
+from wheretolook.features.extractor import ExtractorConfig
 from wheretolook.figures import KINDS
 from wheretolook.mapping.config import FrameOptions
 from wheretolook.utils.errors import ConfigError, MapError, WhereToLookError, check_choice

@@ -40,7 +40,7 @@ from wheretolook.utils.files import cache_key, check_folder_name, fingerprint, p
 
 
 @dataclass(frozen=True, kw_only=True)
-class Map(SceneOptions, LabelOptions, FrameOptions):
+class BuildMap(SceneOptions, LabelOptions, FrameOptions):
     """Build a COLMAP map of every scene from renders, or of photographs: --images. Or import one: --model.
 
     A model of your own, from COLMAP or hloc, becomes a scene for sample, viewpoint-map and plan, in metres with z up
@@ -155,7 +155,7 @@ class Map(SceneOptions, LabelOptions, FrameOptions):
         return dataset
 
 
-def _map_mesh(options: Map, files: SceneFolder, log: Log) -> None:
+def _map_mesh(options: BuildMap, files: SceneFolder, log: Log) -> None:
     """Map a scene by renders of its mesh, unless its map is current."""
     config = options.mapping
     scene = open_scene(options, files)
@@ -208,7 +208,7 @@ def _seed(scene: SceneFolder) -> int:
     return zlib.crc32(scene.name.encode()) % 2**31
 
 
-def _map_photographs(options: Map, log: Log) -> SceneFolder:
+def _map_photographs(options: BuildMap, log: Log) -> SceneFolder:
     """Map the photographs in `photographs.images`: `<scene>/map/`, with finished steps in `<scene>/photographs/`.
 
     Returns the scene, with the camera of most photographs unless one is configured. Raises what `map_photographs` does.
@@ -250,7 +250,7 @@ def _map_photographs(options: Map, log: Log) -> SceneFolder:
     return _with_mapping_camera(options, scene)
 
 
-def _import_model(options: Map, log: Log) -> tuple[SceneFolder, Dataset]:
+def _import_model(options: BuildMap, log: Log) -> tuple[SceneFolder, Dataset]:
     """Make a scene of the model in `options.model`: `<scene>/map/`, and `<scene>/mesh.glb` if a mesh is given.
 
     Returns the scene, and the dataset with it. Raises what `map_existing` does, and SceneError if the mesh cannot be used.
@@ -307,7 +307,7 @@ def _import_model(options: Map, log: Log) -> tuple[SceneFolder, Dataset]:
     return scene, dataset
 
 
-def _new_scene(options: Map, source: Path) -> SceneFolder:
+def _new_scene(options: BuildMap, source: Path) -> SceneFolder:
     """Return the scene of a folder of photographs or a model.
 
     Raises ConfigError if the name cannot be a folder's, or the scene's map would be replaced by one of another source.
@@ -325,7 +325,7 @@ def _new_scene(options: Map, source: Path) -> SceneFolder:
     return scene
 
 
-def _with_mapping_camera(options: Map, scene: SceneFolder) -> SceneFolder:
+def _with_mapping_camera(options: BuildMap, scene: SceneFolder) -> SceneFolder:
     """Return the scene with the camera that took most of its photographs, unless the options configure one."""
     from wheretolook.geometry.camera import cameras_by_id
     from wheretolook.mapping.colmap_model import read_model
@@ -412,7 +412,7 @@ def imports_map(run: Callable[..., Any]) -> Callable[..., Any]:
     def run_on_scene(command: Any, log: Log = print, progress: Progress = ignore_progress) -> Any:
         if command.map is not None:
             mapping = MapConfig(extractor=command.mapping.extractor)
-            select_options(Map, command, mapping=mapping, model=command.map).run(log)
+            select_options(BuildMap, command, mapping=mapping, model=command.map).run(log)
         return run(command, log, progress)
 
     return run_on_scene

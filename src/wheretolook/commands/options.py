@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeVar, get_args
 
 from wheretolook.dataset.config import RELEASE_FILE
 from wheretolook.dataset.sampling_config import SampleConfig
-from wheretolook.features.config import ExtractorConfig
+from wheretolook.features.extractor import ExtractorConfig
 from wheretolook.geometry.camera import Camera, CameraConfig, describe_camera
 from wheretolook.localization.config import LabelConfig
 from wheretolook.mapping.config import MapConfig

@@ -108,7 +108,7 @@ WAIT_S = 120.0  # for another plan to write its path into the same folder
 
 def _summary(path: PlannedPath) -> str:
     """Describe a path and its stops in a line."""
-    from wheretolook.planning.routes import lengths_along
+    from wheretolook.planning.view_sequence import lengths_along
 
     text = f"{path.length_m:.2f} m, {path.turn_deg:.0f} degrees of turning, views: {len(path.positions)}"
     if not np.isnan(path.scores).any():

@@ -54,9 +54,8 @@ def match(
         return [Matches.none(length) for length in lengths]
     near, squared = matcher.nearest(np.concatenate(descriptors), count)
     ends = np.cumsum(lengths)[:-1]
-    return [
-        _by_ratio(*of_image, max_ratio) for of_image in zip(np.split(near, ends), np.split(squared, ends), strict=True)
-    ]
+    images = zip(np.split(near, ends), np.split(squared, ends), strict=True)
+    return [_by_ratio(rows, distances, max_ratio) for rows, distances in images]
 
 
 def _by_ratio(near: NDArray[np.int64], squared: NDArray[np.float32 | np.int64], max_ratio: float) -> Matches:

@@ -15,16 +15,12 @@ from wheretolook.features.matches import Matches
 from wheretolook.utils.texts import LOG
 
 GROUP = 32  # landmarks; the best groups are selected first, and in them the best landmarks
-CPU_GROUP = 16  # divides it; matching an image takes a tenth less than with 32
 MAX_NEAREST = 16  # landmarks that `DescriptorMatcher.nearest` returns at most
 MISSING_PRODUCT = -(2**28)
 MISSING = 2**28  # squared distance
-# Size of a block of products. Products of few queries are slow; on a GPU, where each worker holds a block and its
-# intermediate results, blocks of 1 GiB are no faster. On a CPU blocks of 16 MiB, beyond its cache, take a tenth more.
+# Size of a block of products. On a GPU, where each worker holds a block and its intermediate results, blocks of 1 GiB
+# are no faster. On a CPU blocks of 16 MiB, beyond its cache, take a tenth more.
 _PRODUCT_BYTES = {"cpu": 2**23, "cuda": 2**27}
-MIN_BLOCK = (
-    16  # descriptors compared at a time, whatever the size of the map: with 4, a product takes 2.5 times as long
-)
 
 
 class DescriptorMatcher:
@@ -66,7 +62,8 @@ class DescriptorMatcher:
         # OpenMP's limit is per thread: without this, the first product in a new thread would start a thread per core.
         torch.set_num_threads(torch.get_num_threads())
         queries = torch.from_numpy(descriptors).to(self.device)
-        block = max(MIN_BLOCK, _PRODUCT_BYTES[self.device.type] // (4 * self._descriptors.shape[1]))
+        # products of few queries are slow: with 4, a product takes 2.5 times as long as with 16
+        block = max(16, _PRODUCT_BYTES[self.device.type] // (4 * self._descriptors.shape[1]))
         parts = [self._best(part, count) for part in queries.split(block)]
         rows, best = (torch.cat([part[i] for part in parts]).cpu().long().numpy() for i in (0, 1))
         return rows, best
@@ -94,7 +91,7 @@ def largest(product: Tensor, count: int) -> tuple[Tensor, Tensor]:
     `n` is a multiple of `GROUP`, of at least `count` groups.
     """
     # A group's columns are a stride apart: maxima of neighbours in memory take a GPU several times as long.
-    size = CPU_GROUP if product.device.type == "cpu" else GROUP
+    size = 16 if product.device.type == "cpu" else GROUP  # on a CPU matching takes a tenth less than with 32
     groups = product.view(len(product), size, product.shape[1] // size)
     best_groups = groups.amax(1).topk(count, dim=1).indices
     candidates = groups.gather(2, best_groups[:, None].expand(-1, size, -1)).flatten(1)  # of all groups in turns
@@ -123,7 +120,6 @@ def _byte_products_are_fast() -> bool:
 
 
 _PRODUCTS = {"cpu": 2**22, "cuda": 2**25}  # per block: a CPU keeps them in its cache, on a GPU more are slower
-_BATCH = {"cpu": 1, "cuda": 16}  # images per batch; learned extractors give few keypoints per image
 
 
 class SimilarityMatcher:
@@ -146,7 +142,7 @@ class SimilarityMatcher:
         """
         # OpenMP's limit is per thread: without this, the first product in a new thread would start a thread per core.
         torch.set_num_threads(torch.get_num_threads())
-        batch = _BATCH[self.device.type]
+        batch = 1 if self.device.type == "cpu" else 16  # images; learned extractors give few keypoints in each
         return [
             matches
             for start in range(0, len(descriptors), batch)
@@ -205,20 +201,12 @@ def _largest(product: Tensor, count: int) -> tuple[Tensor, Tensor]:
     return largest(product, count)
 
 
-MIN_LANDMARKS = 200_000
-"""Landmarks from which on an image is matched by the index: up to here the exact search takes about a second for 2,000 keypoints."""
-
-_LISTS = 1024
-_SEARCHED_LISTS = 32
-_CANDIDATES = 64  # landmarks that the index proposes for a keypoint
-_TRAINING_PER_LIST = 40
-_BLOCK = 100_000  # landmarks added at a time, in single precision
-_QUERIES = 256  # keypoints compared with their candidates at a time
-
-
 def has_index(n_landmarks: int, device: str) -> bool:
-    """Return whether an index serves a map of this size; warns if it would but FAISS is missing."""
-    if device != "cpu" or n_landmarks < MIN_LANDMARKS:
+    """Return whether an index serves a map of this size; warns if it would but FAISS is missing.
+
+    The exact search takes about a second for 2,000 keypoints in a map of 200,000 landmarks.
+    """
+    if device != "cpu" or n_landmarks < 200_000:
         return False
     if find_spec("faiss") is None:
         advice = "pip install 'wheretolook[large]' makes this more than twenty times as fast"
@@ -234,33 +222,35 @@ class DescriptorIndex:
     `DescriptorMatcher`. One keypoint in a hundred has another nearest landmark than by the exact search.
     """
 
-    def __init__(self, descriptors: NDArray[np.uint8]) -> None:
+    def __init__(self, descriptors: NDArray[np.uint8], lists: int = 1024) -> None:
         import faiss
 
         self.n_landmarks, length = descriptors.shape
         self._descriptors = descriptors
         self._quantizer = faiss.IndexFlatL2(length)
-        self._index = faiss.IndexIVFPQFastScan(self._quantizer, length, _LISTS, length // 2, 4)
+        self._index = faiss.IndexIVFPQFastScan(self._quantizer, length, lists, length // 2, 4)
         self._index.cp.niter = 8
-        self._index.nprobe = _SEARCHED_LISTS
-        n_training = min(self.n_landmarks, _TRAINING_PER_LIST * _LISTS)
+        self._index.nprobe = 32  # lists that are searched
+        n_training = min(self.n_landmarks, 40 * lists)
         sample = np.random.default_rng(0).choice(self.n_landmarks, n_training, replace=False)
         self._index.train(descriptors[sample].astype(np.float32))
-        for start in range(0, self.n_landmarks, _BLOCK):
-            self._index.add(descriptors[start : start + _BLOCK].astype(np.float32))
+        block = 100_000  # in single precision
+        for start in range(0, self.n_landmarks, block):
+            self._index.add(descriptors[start : start + block].astype(np.float32))
 
     def nearest(self, descriptors: NDArray[np.uint8], count: int = 2) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Rows of the nearest landmarks of each descriptor (K, 128) and their squared distances, ascending; (K, count).
 
         Landmarks that the index does not find have the distance `MISSING`.
         """
-        _, proposed = self._index.search(descriptors.astype(np.float32), _CANDIDATES)
+        _, proposed = self._index.search(descriptors.astype(np.float32), 64)  # candidates of each keypoint
+        block = 256  # keypoints that are compared with their candidates at a time
         parts = [np.zeros((0, count), dtype=np.int64)]
         distances = parts.copy()
-        for start in range(0, len(descriptors), _QUERIES):
-            rows = proposed[start : start + _QUERIES]
+        for start in range(0, len(descriptors), block):
+            rows = proposed[start : start + block]
             candidates = self._descriptors[rows].astype(np.float32)
-            queries = descriptors[start : start + _QUERIES, :, None].astype(np.float32)
+            queries = descriptors[start : start + block, :, None].astype(np.float32)
             products = (candidates @ queries)[..., 0].astype(np.int64)  # exact: 128 * 255^2 < 2^24
             # of descriptors of length 512; rounding makes some a little longer, hence the maximum
             squared = np.where(rows < 0, MISSING, np.maximum(2 * (512**2 - products), 0))

@@ -5,30 +5,22 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from wheretolook.features.extractor import Keypoints, unit_descriptors
-
-MAX_KEYPOINTS = 2048
-PEAK_THRESHOLD = 0.02 / 3
-EDGE_THRESHOLD = 10.0
+from wheretolook.features.extractor import ExtractorConfig, Keypoints, unit_descriptors
 
 
 class RootSift:
-    """Extracts keypoints from grey images; for the arguments see `wheretolook.features.config.ExtractorConfig`."""
+    """Extracts keypoints from grey images."""
 
-    def __init__(
-        self,
-        max_keypoints: int = MAX_KEYPOINTS,
-        first_octave: int = -1,
-        peak_threshold: float = PEAK_THRESHOLD,
-        edge_threshold: float = EDGE_THRESHOLD,
-    ) -> None:
+    def __init__(self, config: ExtractorConfig = ExtractorConfig()) -> None:
         import cv2
 
-        self.max_keypoints = max_keypoints
-        self.first_octave = first_octave
+        self.max_keypoints = config.max_keypoints
+        self.first_octave = config.first_octave
         # OpenCV divides its contrast threshold by the number of layers. Without the precise upscale, keypoints are
         # biased.
-        self._sift = cv2.SIFT.create(0, 3, 3 * peak_threshold, edge_threshold, 1.6, enable_precise_upscale=True)
+        self._sift = cv2.SIFT.create(
+            0, 3, 3 * config.peak_threshold, config.edge_threshold, 1.6, enable_precise_upscale=True
+        )
 
     def extract(self, grey: NDArray[np.uint8]) -> Keypoints:
         """Extract the keypoints of an image (H, W) uint8, those of most contrast first."""

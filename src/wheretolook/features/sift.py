@@ -6,21 +6,12 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+import pycolmap
 from numpy.typing import NDArray
 
-from wheretolook.features.config import ExtractorConfig
-from wheretolook.features.extractor import (
-    DescriptorKind,
-    Extraction,
-    Extractor,
-    Keypoints,
-    check_image,
-    unit_descriptors,
-)
+from wheretolook.features.extractor import Extraction, ExtractorConfig, Keypoints, check_image, unit_descriptors
 from wheretolook.features.opencv_sift import RootSift
 from wheretolook.utils.texts import quiet_colmap
-
-SIFT = DescriptorKind("sift", 128, "uint8", colmap_type=0)
 
 
 class OpenCvSift:
@@ -29,7 +20,7 @@ class OpenCvSift:
     batch = 1
 
     def __init__(self, config: ExtractorConfig) -> None:
-        self._sift = RootSift(config.max_keypoints, config.first_octave, config.peak_threshold, config.edge_threshold)
+        self._sift = RootSift(config)
 
     def extract_batch(self, images: Sequence[NDArray[np.uint8]]) -> list[Keypoints]:
         """Keypoints of images (H, W, 3) uint8, those of most contrast first."""
@@ -41,9 +32,7 @@ class ColmapSift:
 
     batch = 1
 
-    def __init__(self, config: ExtractorConfig) -> None:
-        import pycolmap
-
+    def __init__(self, config: ExtractorConfig, device: str = "cpu") -> None:
         self.config = config
         options = pycolmap.FeatureExtractionOptions()
         options.num_threads = 1
@@ -85,14 +74,10 @@ class GpuSift:
 
 def grey_bitmap(rgb: NDArray[np.uint8]) -> Any:
     """Convert to grey as COLMAP does (Rec. 709 weights); with other weights other keypoints pass the thresholds."""
-    import pycolmap
-
     check_image(rgb)
     return pycolmap.Bitmap.from_array(np.ascontiguousarray(rgb)).clone_as_grey()
 
 
-def _opencv(config: ExtractorConfig, device: str) -> Extraction:
+def opencv_or_gpu(config: ExtractorConfig, device: str) -> Extraction:
+    """Return OpenCV's SIFT on a CPU core, or by Warp kernels on a CUDA device."""
     return OpenCvSift(config) if device == "cpu" else GpuSift(config, device)
-
-
-EXTRACTORS = (Extractor("opencv", SIFT, _opencv), Extractor("colmap", SIFT, lambda config, device: ColmapSift(config)))

@@ -12,12 +12,9 @@ import warp as wp
 from numpy.typing import NDArray
 
 from wheretolook.features import warp_sift_kernels as kernels
-from wheretolook.features.config import ExtractorConfig
-from wheretolook.features.extractor import Keypoints
+from wheretolook.features.extractor import ExtractorConfig, Keypoints
 from wheretolook.features.warp_sift_kernels import BORDER, KEYS_OF_IMAGE, LAYERS, LEVELS, MAX_SIDE
 from wheretolook.utils.warp import Staging, start_warp
-
-_ASSUMED_SIGMA = 0.5  # blur of an input image, in its pixels
 
 
 class WarpSift:
@@ -94,14 +91,15 @@ class WarpSift:
         """
         n = len(keys)
         places = kernels.Places()
-        for name, dtype in kernels.PLACE_TYPES.items():
+        types = {"level": wp.int32, "octave": wp.int32, "at": wp.vec2i, "centre": wp.vec2, "sigma": wp.float32}
+        for name, dtype in types.items():
             setattr(places, name, self._buffer(name, n, dtype))
         table = self._buffer("table", n, wp.float32, 4)
         histograms = self._buffer(
             "orientation_histograms", n, wp.float32, kernels.HISTOGRAM_LANES, kernels.ORIENTATION_BINS
         )
         n_orientations = self._buffer("n_orientations", n, wp.int32)
-        angles = self._buffer("angles", n, wp.float32, kernels.MAX_ORIENTATIONS)
+        angles = self._buffer("angles", n, wp.float32, kernels.ORIENTATION_BINS // 2)  # at most every other is a peak
         on_device = self._upload("keys", keys, wp.int64)
         self._launch(kernels.place_kernel, n, [space.pyramid, on_device, self._limits], [places, table])
         self._launch(
@@ -242,9 +240,9 @@ class ScaleSpace:
             """From level to level of an octave, with the filter of the latter."""
             along_rows, along_columns = kernels_of[self.radii[target]]
             half = level_of(octave, 0, half_smooth=True)
-            weights = self.weights, self.first_weights[target]
-            add(along_rows, octave, level_of(octave, source), half, *weights)
-            add(along_columns, octave, half, level_of(octave, target), *weights)
+            first = self.first_weights[target]
+            add(along_rows, octave, level_of(octave, source), half, self.weights, first)
+            add(along_columns, octave, half, level_of(octave, target), self.weights, first)
 
         # all before the first launch, so that their module is compiled once
         kernels_of = {
@@ -279,7 +277,7 @@ def values_of_image(rows: int, columns: int) -> int:
 def _sigmas() -> list[float]:
     """Standard deviation of the filter that makes each level from the one before, the first from the doubled image."""
     total = [kernels.SIGMA * 2 ** (level / LAYERS) for level in range(LEVELS)]
-    first = math.sqrt(kernels.SIGMA**2 - (2 * _ASSUMED_SIGMA) ** 2)
+    first = math.sqrt(kernels.SIGMA**2 - (2 * 0.5) ** 2)  # an input image is blurred by 0.5 of its pixels
     return [first, *(math.sqrt(b**2 - a**2) for a, b in pairwise(total))]
 
 

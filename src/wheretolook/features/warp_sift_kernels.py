@@ -15,7 +15,6 @@ wp.set_module_options({"enable_backward": False, "fuse_fp": False})
 LAYERS = wp.constant(3)  # of each octave, searched for extrema
 LEVELS = wp.constant(6)  # of the Gaussian in each octave
 BORDER = wp.constant(5)  # distance in pixels from an octave's border that is not searched for extrema
-STEPS = wp.constant(5)  # of refinement, after which a candidate that still moves is dropped
 SIGMA = wp.constant(1.6)  # of an octave's first level, in its pixels
 
 MAX_SIDE = wp.constant(1 << 14)  # rows or columns of a doubled image; this and the two below make up a key
@@ -191,7 +190,7 @@ def refined(pyramid: Pyramid, image: int, octave: int, layer: int, row: int, col
     yy = wp.float32(0.0)
     xy = wp.float32(0.0)
     middle = wp.float32(0.0)
-    while inside and not settled and step < STEPS:
+    while inside and not settled and step < 5:  # a candidate that still moves is dropped
         at = start + layer * size + row * columns + column
         middle = difference(values, at, size)
         east = difference(values, at + 1, size)
@@ -286,18 +285,10 @@ def extrema_kernel(pyramid: Pyramid, octave: int, limits: Limits, number: wp.arr
                 keys[slot] = key_of(image, octave, peak.layer, peak.row, peak.column)
 
 
-# mypy: ignore-errors
-# Warp's kernel language is not Python's type system.
-
-
-wp.set_module_options({"enable_backward": False, "fuse_fp": False})
-
 ORIENTATION_BINS = wp.constant(36)  # of the histogram of directions near a keypoint
-MAX_ORIENTATIONS = wp.constant(18)  # peaks that a histogram of 36 bins can have
 HISTOGRAM_LANES = wp.constant(8)  # threads that share the rows near a keypoint
 CELLS = wp.constant(4)  # along each side of a descriptor
 CELL_BINS = wp.constant(8)  # directions in each
-SIDE_OF_CELL = wp.constant(3.0)  # width of a descriptor's cell in standard deviations of the keypoint's Gaussian
 
 OrientationHistogram = wp.types.vector(length=36, dtype=wp.float32)
 CellHistogram = wp.types.vector(length=8, dtype=wp.float32)
@@ -312,9 +303,6 @@ class Places:
     at: wp.array[wp.vec2i]  # column, row
     centre: wp.array[wp.vec2]  # column, row, refined
     sigma: wp.array[wp.float32]  # standard deviation of its Gaussian, in pixels of the octave
-
-
-PLACE_TYPES = {"level": wp.int32, "octave": wp.int32, "at": wp.vec2i, "centre": wp.vec2, "sigma": wp.float32}
 
 
 @wp.kernel
@@ -436,7 +424,7 @@ def describe_kernel(
     centre = places.centre[place]
     x = wp.int32(wp.rint(centre[0]))
     y = wp.int32(wp.rint(centre[1]))
-    width = SIDE_OF_CELL * places.sigma[place]
+    width = 3.0 * places.sigma[place]  # of a cell
     turned = (360.0 - angles[row]) / 360.0
     cosine = wp.cos(turned * 2.0 * wp.pi)
     sine = wp.sin(turned * 2.0 * wp.pi)

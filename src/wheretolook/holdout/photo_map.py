@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from wheretolook.dataset.config import THRESHOLDS
-from wheretolook.features.config import ExtractorConfig
+from wheretolook.features.extractor import ExtractorConfig
 from wheretolook.geometry.camera import Camera, PinholeCamera, cameras_by_id, field_of_view_deg
 from wheretolook.geometry.poses import Float, camera_centers
 from wheretolook.geometry.similarity import Similarity

@@ -68,7 +68,7 @@ class Scoring:
         if self.method:
             scorer = make_scorer(self.method, localization_map, weights=chosen, anywhere=anywhere)
         else:
-            scorer = load_scorer(chosen, localization_map, anywhere=anywhere)
+            scorer = load_scorer(localization_map, chosen, anywhere=anywhere)
         return scorer if self.accuracy is None else scorer.at_accuracy(self.accuracy)
 
 

@@ -73,20 +73,12 @@ RIGHT_PLACE: Accuracy = (math.inf, math.inf)
 RIGHT_PLACE_LIMITS: Accuracy = (0.5, 5.0)
 
 MIN_INLIERS = 10  # with fewer, the localizer itself rejects a pose
-MIN_DEVIATION_DEG = 1e-4
-MAX_DEVIATION_DEG = 10.0
-
-
-PSEUDOCOUNT = 10.0
-"""Additive smoothing of both counts of a comparison: 1 against 0 is not decisive."""
 
 
 def log_ratio(unique: ArrayLike, rival_unique: ArrayLike) -> Float:
-    """Damped log ratio of the unique support (...,) of two poses."""
-    return np.log(
-        (np.asarray(unique, dtype=np.float64) + PSEUDOCOUNT)
-        / (np.asarray(rival_unique, dtype=np.float64) + PSEUDOCOUNT)
-    )
+    """Log ratio of the unique support (...,) of two poses, both smoothed by 10: 1 against 0 is not decisive."""
+    smoothed = np.asarray(unique, dtype=np.float64) + 10.0
+    return np.log(smoothed / (np.asarray(rival_unique, dtype=np.float64) + 10.0))
 
 
 def confidence_features(
@@ -99,7 +91,7 @@ def confidence_features(
 ) -> Float:
     """`FEATURE_NAMES` (B, 4) of B joint poses."""
     inlier_ratio = (np.asarray(n_inliers, dtype=np.float64) + 0.5) / (np.asarray(n_matches, dtype=np.float64) + 1)
-    deviation = np.clip(np.asarray(deviation_deg, dtype=np.float64), MIN_DEVIATION_DEG, MAX_DEVIATION_DEG)
+    deviation = np.clip(np.asarray(deviation_deg, dtype=np.float64), 1e-4, 10.0)
     support_ratio = log_ratio(unique_support, rival_unique_support)
     rival = np.log1p(np.asarray(rival_support, dtype=np.float64))
     return np.stack([rival, np.log(inlier_ratio), support_ratio, np.log(deviation)], axis=-1)

@@ -23,6 +23,7 @@ from wheretolook.dataset.viewpoint_files import SCHEMA, read_table, write_table
 from wheretolook.dataset.viewpoint_table import CAMERA_ID, LABELS
 from wheretolook.localization.config import LabelConfig, versions
 from wheretolook.localization.shard import LabelledShard, SceneJob, Shard, ShardWorker, run_local
+from wheretolook.rendering.warp_renderer import method_on
 from wheretolook.utils.errors import ConfigError, TableError, WhereToLookError, WorkerError
 from wheretolook.utils.files import atomic_write, fingerprint, sha256, write_json
 from wheretolook.utils.package import require
@@ -30,9 +31,6 @@ from wheretolook.utils.processes import cores
 
 MANIFEST = "manifest.json"
 """File in the folder of shards with the settings of the labels; later `labels.json` next to the table."""
-
-MIN_VIEWS_PER_CAMERA = 16
-"""Minimum mean number of views of each of several cameras in a shard on a GPU: a batch is of one camera."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,8 +134,8 @@ class _SceneInProgress:
         text = json.dumps(settings, sort_keys=True).encode()
         inputs = [name for name in (*SCHEMA.names, CAMERA_ID) if name not in LABELS and name in table]
         shards = []
-        if job.device != "cpu":
-            shard_size = max(shard_size, MIN_VIEWS_PER_CAMERA * len(job.cameras))
+        if job.device != "cpu":  # a batch is of one camera
+            shard_size = max(shard_size, 16 * len(job.cameras))
         for begin in range(0, len(table), shard_size):
             rows = table.iloc[begin : begin + shard_size]
             content = pd.util.hash_pandas_object(rows[inputs], index=False).to_numpy()
@@ -156,8 +154,6 @@ class _SceneInProgress:
 
 def _renderer_name(device: str) -> str:
     """Kind of device and rendering method, which round some pixels differently."""
-    from wheretolook.rendering.warp_renderer import method_on
-
     kind = device.partition(":")[0]
     return f"{kind} {method_on(kind)}"
 
@@ -182,18 +178,12 @@ def _is_finished(shard: Shard) -> bool:
         return False
 
 
-MAX_RETRIES = 5
-"""Restarts of a shard whose process or machine was lost."""
-
-WORKERS_PER_GPU = 16
-
-
 def run_ray(shards: Sequence[Shard], address: str = "") -> Iterator[tuple[Shard, LabelledShard]]:
-    """Label shards on a Ray cluster, each on one core and, with a CUDA device, `1 / WORKERS_PER_GPU` of a GPU.
+    """Label shards on a Ray cluster, each on one core and, with a CUDA device, a sixteenth of a GPU.
 
     They are begun in this order and yielded as they are finished. An empty address uses the cluster that this process
     is connected to, or starts one on this machine. Raises what a worker raises, ConfigError if Ray is not installed or
-    the cluster cannot be used, WorkerError if a shard was lost more than `MAX_RETRIES` times.
+    the cluster cannot be used, WorkerError if a shard was lost more than five times.
     """
     require("ray")
     import ray
@@ -234,13 +224,13 @@ def _run_on_ray(ray: Any, shards: Sequence[Shard]) -> Iterator[tuple[Shard, Labe
     waiting = iter(shards)
     running = dict[Any, Shard]()
     files = dict[SceneJob, Any]()
-    label = ray.remote(num_cpus=1, max_retries=MAX_RETRIES)(_label_shard)
+    label = ray.remote(num_cpus=1, max_retries=5)(_label_shard)
 
     def start(shard: Shard) -> None:
         if shard.job not in files:  # a scene travels to a machine once
             files.clear()
             files[shard.job] = ray.put([path.read_bytes() for path in _files(shard.job).values()])
-        gpus = 1 / WORKERS_PER_GPU if shard.job.device != "cpu" else 0
+        gpus = 1 / 16 if shard.job.device != "cpu" else 0
         running[label.options(num_gpus=gpus).remote(shard.job, files[shard.job], shard.rows)] = shard
 
     try:

@@ -12,18 +12,12 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 
-from wheretolook.features.extractor import Keypoints
+from wheretolook.features.extractor import EXTRACTORS, KINDS, Keypoints
 from wheretolook.features.learned import kornia_feature, load_state, one_thread
-from wheretolook.features.registry import all_extractors, all_kinds
 from wheretolook.mapping.colmap_model import model_arrays, read_model
 from wheretolook.mapping.feature_files import read_features
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.utils.errors import ConfigError, MapError, WeightsError
-
-N_IMAGES = 5  # that a query is matched with
-KORNIA_WEIGHTS = "kornia"  # in place of a file
-FIRST_WEIGHTS = {"aliked": -0.3284747, "disk": -0.6789149}  # of the authors' files, whose tensors have equal shapes
-_DATABASE = "database.db"
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,13 +47,11 @@ class LightGlueMatcher:
         device: str = "cpu",
         features: Path | None = None,
     ) -> None:
-        supported = {
-            record.descriptors.name: record.lightglue for record in all_extractors().values() if record.lightglue
-        }
+        supported = {record.descriptors.name: record.lightglue for record in EXTRACTORS.values() if record.lightglue}
         if landmarks.features not in supported:
             fix = f"Leave LightGlue out, or map with one of {', '.join(supported)}."
             raise ConfigError("LightGlue does not support these features", value=landmarks.features, fix=fix)
-        features = features or (None if map_dir is None else map_dir / _DATABASE)
+        features = features or (None if map_dir is None else map_dir / "database.db")
         if map_dir is None or features is None or not features.is_file():
             fix = "Name it by --database, or map again with --mapping.keep_database true."
             raise MapError("LightGlue needs the features of the mapping images", path=features or map_dir, fix=fix)
@@ -67,7 +59,7 @@ class LightGlueMatcher:
         self.map_dir = map_dir
         self.features = features
         self.device = torch.device(device)
-        self.kind = all_kinds()[landmarks.features]
+        self.kind = KINDS[landmarks.features]
         self._network = _network(supported[landmarks.features], weights).to(self.device)
 
     def match(
@@ -82,7 +74,7 @@ class LightGlueMatcher:
         images = self._images
         voted = np.isin(np.arange(len(self.landmarks)), landmark_rows)[images.landmark]
         votes = np.bincount(images.observer[voted], minlength=len(images.stored))
-        best = np.argsort(-votes, kind="stable")[:N_IMAGES]
+        best = np.argsort(-votes, kind="stable")[:5]
         matches = [self._match_image(query, size, int(image)) for image in best[votes[best] > 0]]
         if not matches:
             return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
@@ -137,7 +129,7 @@ class LightGlueMatcher:
 
 
 def _network(features: str, weights: str) -> Any:
-    """LightGlue for some features, with weights from a file or `KORNIA_WEIGHTS`."""
+    """LightGlue for some features, with weights from a file, or "kornia" for its copy."""
     light_glue = kornia_feature().LightGlue
     settings = {name: value for name, value in light_glue.features[features].items() if name != "weights"}
     network = light_glue(features=None, **settings)
@@ -152,10 +144,11 @@ def _network(features: str, weights: str) -> Any:
         renamed = {names[key].removeprefix("matcher."): value for key, value in state.items()}
         return {key: value for key, value in renamed.items() if key in network.state_dict()}
 
-    file = "" if weights == KORNIA_WEIGHTS else weights
+    file = "" if weights == "kornia" else weights
     load_state(network, file, name, [url], prepare, "--label.localizer.lightglue (of localize --lightglue)")
+    first_weights = {"aliked": -0.3284747, "disk": -0.6789149}  # of the authors' files, whose tensors have equal shapes
     known = network.posenc.Wr.weight[0, 0].item()
-    other = next((other for other, value in FIRST_WEIGHTS.items() if abs(known - value) < 1e-6), features)
+    other = next((other for other, value in first_weights.items() if abs(known - value) < 1e-6), features)
     if other != features:
         problem = f"these are LightGlue weights for {other}, but the map has {features} features"
         raise WeightsError(problem, path=weights, fix=f"Give {name}.")

@@ -6,30 +6,25 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from wheretolook.dataset.config import LOCALIZED, NO_POSE, TOO_FEW_MATCHES
-from wheretolook.features.config import ExtractorConfig, KeypointExtractor
-from wheretolook.features.extractor import Keypoints
+from wheretolook.features.extractor import KINDS, ExtractorConfig, KeypointExtractor, Keypoints, kind_of
 from wheretolook.features.matches import Matches, match
 from wheretolook.features.matching import MAX_NEAREST, DescriptorIndex, DescriptorMatcher, SimilarityMatcher, has_index
-from wheretolook.features.registry import all_kinds, kind_of
 from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.poses import Float, pose_error
 from wheretolook.geometry.similarity import poses_from
 from wheretolook.localization.config import LocalizerConfig
 from wheretolook.localization.estimation import PoseEstimator
+from wheretolook.localization.lightglue import LightGlueMatcher
 from wheretolook.localization.rig import Look
 from wheretolook.localization.rig_localization import POSES_OF_AN_IMAGE, JointLocalizer
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.utils.errors import MapError
-
-if TYPE_CHECKING:
-    from wheretolook.localization.lightglue import LightGlueMatcher
-
 
 Matcher = DescriptorMatcher | DescriptorIndex | SimilarityMatcher
 
@@ -80,7 +75,7 @@ class Localizer:
             raise MapError("landmarks without descriptors cannot be matched", fix="Build the map with its database.")
         self.landmarks = landmarks
         self.config = config
-        self.kind = all_kinds()[landmarks.features]
+        self.kind = KINDS[landmarks.features]
         self._extractor = extractor or ExtractorConfig()
         if extractor is not None:
             self._check_extractor()
@@ -90,8 +85,6 @@ class Localizer:
         self._matcher = DescriptorIndex(self._descriptors) if indexed else self._matcher_of(self._descriptors)
         self._guided: LightGlueMatcher | None = None
         if config.lightglue:
-            from wheretolook.localization.lightglue import LightGlueMatcher
-
             self._guided = LightGlueMatcher(landmarks, map_dir, config.lightglue, device, features)
         self.camera = camera
         self.estimator = PoseEstimator(landmarks.points, config)

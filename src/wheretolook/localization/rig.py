@@ -5,22 +5,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePath
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
+from wheretolook.features.matches import Matches
 from wheretolook.geometry.camera import Camera, field_of_view_deg
 from wheretolook.geometry.pose_files import NAME_COLUMNS, QUATERNION_COLUMNS, NamedRows, poses_of_rows, read_named_rows
 from wheretolook.geometry.poses import Float, as_numbers, camera_centers, compose_poses, invert_poses, rigid_poses
 from wheretolook.geometry.similarity import Similarity
 from wheretolook.utils.errors import ConfigError, PoseError, TableError
 from wheretolook.utils.files import path_ends
-
-if TYPE_CHECKING:
-    from wheretolook.features.matches import Matches
-
 
 IDENTITY: Float = np.eye(3, 4)
 
@@ -86,8 +82,6 @@ def checked_turns(turns: ArrayLike, n_views: int) -> Float:
 
     Raises PoseError if one is not rigid, or there are more or fewer than views.
     """
-    from scipy.spatial.transform import Rotation
-
     poses = as_numbers(turns)
     if poses.shape[1:] == (3, 3):
         poses = np.pad(poses, ((0, 0), (0, 0), (0, 1)))
@@ -112,8 +106,6 @@ def rig_of(cam_from_world: Float) -> Float:
     return cam_from_rig
 
 
-MAX_STAMP_DIFFERENCE_S = 0.02  # between an image named by its time and its row of the odometry
-BODY_UPRIGHT = 0.7  # z of a robot's own z axis in odometry, from which on it is no camera
 CAM_FROM_BODY = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])  # a camera that looks along x of a body whose z is up
 
 
@@ -140,7 +132,7 @@ def _poses(table: NamedRows) -> Float:
     """Return cam_from_rig (R, 3, 4) of all rows."""
     if {*QUATERNION_COLUMNS} <= {*table.columns}:
         poses = poses_of_rows(table, orientations_only=True)
-        of_body = table.header[0] == "t" and (poses[:, 2, 2] > BODY_UPRIGHT).all()
+        of_body = table.header[0] == "t" and (poses[:, 2, 2] > 0.7).all()  # z of the robot's z axis: upright
         return CAM_FROM_BODY @ poses if of_body else poses
     angles = np.zeros((len(table.rows), 3))
     for column, name in enumerate(("yaw", "pitch", "roll")):
@@ -181,11 +173,7 @@ def _rows_by_time(table: NamedRows, images: Sequence[PurePath]) -> list[int | No
     except ValueError:
         return []
     difference = np.abs(stamps - times[:, None])
-    return difference.argmin(1).tolist() if (difference.min(1) <= MAX_STAMP_DIFFERENCE_S).all() else []
-
-
-MAX_DISTANCE_RATIO = 2.0  # distance over the mean mapping distance: farther landmarks are hardly detected
-YAW_MARGIN_DEG = 30.0  # how far the yaw may be off
+    return difference.argmin(1).tolist() if (difference.min(1) <= 0.02).all() else []  # seconds
 
 
 @dataclass(frozen=True, eq=False)
@@ -210,10 +198,10 @@ class PosePrior:
     def allows(self, points: Float, mapping_distance_m: Float, camera: Camera) -> NDArray[np.bool_]:
         """Return which landmarks, points (N, 3) m, the camera may detect from near the prior, whatever its pitch."""
         offset: Float = points - self.location
-        allowed = np.linalg.norm(offset, axis=1) <= MAX_DISTANCE_RATIO * mapping_distance_m
+        allowed = np.linalg.norm(offset, axis=1) <= 2.0 * mapping_distance_m  # farther ones are hardly detected
         if self.yaw_deg is not None:
             angle = np.degrees(np.arctan2(offset[:, 1], offset[:, 0])) - self.yaw_deg
-            limit = max(field_of_view_deg(camera)) / 2 + YAW_MARGIN_DEG
+            limit = max(field_of_view_deg(camera)) / 2 + 30.0  # degrees that the yaw may be off
             allowed &= np.abs((angle + 180) % 360 - 180) <= limit
         return np.asarray(allowed)
 

@@ -53,7 +53,7 @@ class JointLocalization:
         inliers: N masks (M_k,) of each view's matches that agree with the pose.
         n_matches: matches of all views with the whole map.
         support: sum over inliers of a weight that falls from 1 to 0 as the error rises to its limit.
-        rival_support: greatest support of a competing pose (see `MIN_POSE_SEPARATION`); 0 if there is none.
+        rival_support: greatest support of a competing pose (see `Hypothesis.differs_from`); 0 if there is none.
         unique_support: numbers of locations with inliers of this pose that the strongest rival cannot explain, and with
             inliers of the rival that this pose cannot explain (`PoseAmbiguity`); all and 0 if there is no rival.
         covariance: (6, 6) of position (m) and orientation (rad) in the world given the inliers; infinite where they
@@ -193,6 +193,8 @@ class JointLocalizer:
         for k, pose in enumerate(hypotheses):
             for n, other in enumerate(hypotheses):
                 if n != k:
-                    poses = pose.rig_from_world, other.rig_from_world
-                    unique[k, n] = self.ambiguity.unique_support(pose.inlier_rows, *poses)
+                    only_here = self.ambiguity.unique_support(
+                        pose.inlier_rows, pose.rig_from_world, other.rig_from_world
+                    )
+                    unique[k, n] = only_here
         return unique

@@ -4,33 +4,33 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import cv2
 import numpy as np
 import pandas as pd
+import torch
 from numpy.typing import NDArray
 
 from wheretolook.dataset.viewpoint_files import FIRST_FIELDS, MATCH_FIELDS
 from wheretolook.dataset.viewpoint_table import APPEARANCE, CAMERA_ID, CHANGES, FIRST, PIXELS, poses
-from wheretolook.features.config import ExtractorConfig
+from wheretolook.features.extractor import ExtractorConfig, Keypoints
+from wheretolook.features.matches import Matches
 from wheretolook.geometry.camera import Camera, PinholeCamera
 from wheretolook.geometry.poses import Float
 from wheretolook.localization.config import LocalizerConfig
+from wheretolook.localization.localizer import Localization, Localizer, localization_errors
+from wheretolook.mapping.landmarks import Landmarks
+from wheretolook.rendering.appearance import Appearance
+from wheretolook.rendering.warp_renderer import Renderer, WarpRenderer
+from wheretolook.scenes.loading import load_mesh
 from wheretolook.utils.devices import halving
 from wheretolook.utils.errors import WhereToLookError, WorkerError
 from wheretolook.utils.processes import WorkerPool, worker_number
-
-if TYPE_CHECKING:
-    from wheretolook.features.extractor import Keypoints
-    from wheretolook.features.matches import Matches
-    from wheretolook.localization.localizer import Localization, Localizer
-    from wheretolook.rendering.appearance import Appearance
-    from wheretolook.rendering.warp_renderer import Renderer
-
 
 _END = object()
 """Marks the end of the items."""
@@ -85,12 +85,6 @@ def _run(step: Step, source: Future[Any], seconds: dict[str, float]) -> Any:
     return item
 
 
-BATCH = 8
-"""Viewpoints of 640 x 480 per batch, unless the extractor wants more; fewer of a larger camera. Many workers share a GPU,
-and each holds its batches' images and scale spaces there.
-"""
-
-
 @dataclass(frozen=True)
 class SceneJob:
     """Everything that a worker needs to label viewpoints of a scene: files of mesh and landmarks, and settings."""
@@ -133,13 +127,10 @@ class ShardWorker:
     """
 
     def __init__(self, number: int = 0) -> None:
-        import cv2
-        import torch
-
         cv2.setNumThreads(1)
         torch.set_num_threads(1)
         self.number = number
-        self._scene: tuple[SceneJob, Renderer, Renderer | None, Localizer] | None = None
+        self._scene: tuple[SceneJob, Localizer, Renderer, Renderer | None] | None = None
 
     def label(self, job: SceneJob, rows: pd.DataFrame) -> LabelledShard:
         """Label viewpoints of a scene.
@@ -148,11 +139,8 @@ class ShardWorker:
         """
         try:
             seconds: dict[str, float] = {}
-            renderer, changed, localizer = self._open(job)
-            cameras = dict(job.cameras) or job.camera
-            options = job.store_matches, job.store_pixels, job.appearance, job.changes, changed
-            labelled = label_rows(rows, renderer, localizer, cameras, seconds, *options)
-            return LabelledShard(labelled, seconds)
+            localizer, renderer, changed = self._open(job)
+            return LabelledShard(label_rows(rows, job, localizer, renderer, changed, seconds), seconds)
         except WhereToLookError:
             raise
         except Exception as error:
@@ -161,15 +149,8 @@ class ShardWorker:
             fix = "Fix the cause and run again; finished shards are kept."
             raise WorkerError(problem, path=job.mesh, value=viewpoints, fix=fix) from error
 
-    def _open(self, job: SceneJob) -> tuple[Renderer, Renderer | None, Localizer]:
-        from wheretolook.localization.localizer import Localizer
-        from wheretolook.mapping.landmarks import Landmarks
-        from wheretolook.rendering.warp_renderer import WarpRenderer
-        from wheretolook.scenes.loading import load_mesh
-
+    def _open(self, job: SceneJob) -> tuple[Localizer, Renderer, Renderer | None]:
         if self._scene is None or self._scene[0] != job:
-            import torch
-
             self._scene = None  # free its memory first
             device = job.device
             if device == "cuda":
@@ -179,7 +160,7 @@ class ShardWorker:
             landmarks = Landmarks.load(job.landmarks)
             map_dir = job.landmarks.parent
             localizer = Localizer(landmarks, job.camera, job.localizer, job.extractor, device, map_dir)
-            self._scene = job, renderer, changed, localizer
+            self._scene = job, localizer, renderer, changed
         return self._scene[1:]
 
 
@@ -203,74 +184,111 @@ def _label_shard(shard: Shard) -> LabelledShard:
 
 def label_rows(
     table: pd.DataFrame,
-    renderer: Renderer,
+    job: SceneJob,
     localizer: Localizer,
-    cameras: Camera | Mapping[int, Camera],
-    seconds: dict[str, float] | None = None,
-    store_matches: bool = False,
-    store_pixels: bool = False,
-    appearance: float = 0.0,
-    changes: float = 0.0,
+    renderer: Renderer,
     changed: Renderer | None = None,
+    seconds: dict[str, float] | None = None,
 ) -> pd.DataFrame:
     """Render viewpoints, localize the images and measure the errors, in batched steps that overlap.
 
-    With several cameras, `camera_id` selects that of a viewpoint. The seconds spent in each step (render, extract,
-    match, pose) are added to `seconds`. A batch that exceeds a GPU's memory is halved. Returns the table with new
-    status, error_m, error_deg and n_inliers, with `viewpoint_files.FIRST_FIELDS` by several hypotheses, `MATCH_FIELDS`
-    if `store_matches`, and also `PIXEL_FIELD` if `store_pixels`. With `appearance` above 0 images are changed at
-    strengths drawn up to it (`rendering.appearance`), which `APPEARANCE_FIELD` holds. With a renderer of the `changed`
-    scene, it renders the views of locations drawn by the localizer's seed, to which `CHANGES_FIELD` assigns `changes`.
+    `renderer` and `changed` show the two meshes of the job. The seconds spent in each step (render, extract, match,
+    pose) are added to `seconds`. A batch that exceeds a GPU's memory is halved. Returns the table with new status,
+    error_m, error_deg and n_inliers, with `viewpoint_files.FIRST_FIELDS` by several hypotheses, `MATCH_FIELDS` and
+    `PIXEL_FIELD` if the job stores them. With an `appearance` above 0 images are changed at strengths drawn up to it
+    (`rendering.appearance`), which `APPEARANCE_FIELD` holds. The changed mesh is shown by the views of locations drawn
+    by the localizer's seed, to which `CHANGES_FIELD` assigns the job's `changes`.
     """
-    from wheretolook.rendering.appearance import Appearance
-
     true_poses = poses(table)
-    if isinstance(cameras, Mapping):
-        numbers = table[CAMERA_ID].to_numpy()
-        groups = [(cameras[number], np.flatnonzero(numbers == number)) for number in np.unique(numbers).tolist()]
-    else:
-        groups = [(cameras, np.arange(len(table)))]
-    is_changed = _is_changed(table, localizer.config.seed) if changed else np.zeros(len(table), dtype=bool)
-    groups = [(camera, rows[is_changed[rows] == which]) for camera, rows in groups for which in (False, True)]
-    batch_size = max(BATCH, localizer.extractor.batch_of(640, 480))
-    batches = [(camera, rows) for camera, group in groups for rows in _batches(camera, group, batch_size)]
-
-    drawn = Appearance.of_views(true_poses, appearance, localizer.config.seed) if appearance else []
-
-    def render(batch: tuple[Camera, NDArray[np.int64]]) -> tuple[Camera, Sequence[NDArray[np.uint8]]]:
-        camera, rows = batch
-        used = changed if changed and is_changed[rows[0]] else renderer
-        return camera, halving(lambda some: _images(used, camera, some, true_poses, drawn))(rows)
-
-    def match(batch: tuple[Camera, list[Keypoints]]) -> tuple[Camera, list[tuple[Keypoints, Matches]]]:
-        camera, keypoints = batch
-        matches = halving(lambda some: localizer.match(some, camera))(keypoints)
-        return camera, list(zip(keypoints, matches, strict=True))
-
-    def estimate(batch: tuple[Camera, list[tuple[Keypoints, Matches]]]) -> list[Localization]:
-        camera, matched = batch
-        return [localizer.estimate(keypoints, matches, camera) for keypoints, matches in matched]
-
-    steps = [  # the camera of a batch goes with it from step to step
-        Step("render", render),
-        Step("extract", lambda batch: (batch[0], halving(localizer.extractor.extract_batch)(batch[1]))),
-        Step("match", match),
-        Step("pose", estimate),
+    seed = localizer.config.seed
+    drawn = Appearance.of_views(true_poses, job.appearance, seed) if job.appearance else []
+    is_changed = _is_changed(table, seed) if changed else np.zeros(len(table), dtype=bool)
+    batches = []
+    # Viewpoints of 640 x 480 per batch, unless the extractor wants more: many workers share a GPU, and each holds its
+    # batches' images and scale spaces there.
+    batch_size = max(8, localizer.extractor.batch_of(640, 480))
+    for camera, rows in _by_camera(table, job):
+        size = min(batch_size, max(1, batch_size * 640 * 480 // (camera.width * camera.height)))
+        shown_in = [(renderer, rows[~is_changed[rows]])]
+        if changed:
+            shown_in.append((changed, rows[is_changed[rows]]))
+        for shown, part in shown_in:
+            for start in range(0, len(part), size):
+                batch = part[start : start + size]
+                batches.append(_Batch(shown, camera, batch, true_poses[batch], [drawn[row] for row in batch if drawn]))
+    labeller = _BatchLabeller(localizer)
+    steps = [
+        Step("render", labeller.render),
+        Step("extract", labeller.extract),
+        Step("match", labeller.match),
+        Step("pose", labeller.estimate),
     ]
     localizations = [result for batch in run_pipeline(batches, steps, seconds) for result in batch]
-    order = np.argsort(np.concatenate([rows for _, rows in groups]))
+    order = np.argsort(np.concatenate([batch.rows for batch in batches]))
     results = [localizations[row] for row in order]
     columns = _labels(results, true_poses)
     if localizer.config.method == "hypotheses":
         columns |= _labels([result.first or result for result in results], true_poses, FIRST)
-    if store_matches or store_pixels:
-        columns |= _matches(results, store_pixels)
+    if job.store_matches or job.store_pixels:
+        columns |= _matches(results, job.store_pixels)
     if drawn:
         columns[APPEARANCE] = np.array([one.strength for one in drawn], dtype=np.float32)
     if changed:
-        columns[CHANGES] = (changes * is_changed).astype(np.float32)
+        columns[CHANGES] = (job.changes * is_changed).astype(np.float32)
     old = [*FIRST_FIELDS.names, *MATCH_FIELDS.names, PIXELS, APPEARANCE, CHANGES]
     return table.drop(columns=old, errors="ignore").assign(**columns)
+
+
+def _by_camera(table: pd.DataFrame, job: SceneJob) -> list[tuple[Camera, NDArray[np.int64]]]:
+    """Return each camera of the job with the rows of its viewpoints."""
+    if not job.cameras:
+        return [(job.camera, np.arange(len(table)))]
+    cameras = dict(job.cameras)
+    numbers = table[CAMERA_ID].to_numpy()
+    return [(cameras[number], np.flatnonzero(numbers == number)) for number in np.unique(numbers).tolist()]
+
+
+@dataclass(frozen=True, eq=False)
+class _Batch:
+    """Some viewpoints that one renderer shows to one camera."""
+
+    renderer: Renderer
+    camera: Camera
+    rows: NDArray[np.int64]  # (B,) of the table
+    cam_from_world: Float  # (B, 3, 4)
+    drawn: Sequence[Appearance]  # B, or none
+
+
+class _BatchLabeller:
+    """Steps by which a batch of views is labelled; the batch goes with its images, keypoints and matches."""
+
+    def __init__(self, localizer: Localizer) -> None:
+        self.localizer = localizer
+
+    def render(self, batch: _Batch) -> tuple[_Batch, Sequence[NDArray[np.uint8]]]:
+        return batch, halving(lambda views: _images(batch, views))(np.arange(len(batch.rows)))
+
+    def extract(self, rendered: tuple[_Batch, Sequence[NDArray[np.uint8]]]) -> tuple[_Batch, list[Keypoints]]:
+        batch, images = rendered
+        return batch, halving(self.localizer.extractor.extract_batch)(images)
+
+    def match(self, extracted: tuple[_Batch, list[Keypoints]]) -> tuple[_Batch, list[Keypoints], list[Matches]]:
+        batch, keypoints = extracted
+        return batch, keypoints, halving(lambda some: self.localizer.match(some, batch.camera))(keypoints)
+
+    def estimate(self, matched: tuple[_Batch, list[Keypoints], list[Matches]]) -> list[Localization]:
+        batch, keypoints, matches = matched
+        views = zip(keypoints, matches, strict=True)
+        return [self.localizer.estimate(found, pairs, batch.camera) for found, pairs in views]
+
+
+def _images(batch: _Batch, views: NDArray[np.int64]) -> NDArray[np.uint8]:
+    """Render some views (V,) of a batch as images (V, H, W, 3), with their appearances if these are drawn."""
+    seen = batch.renderer.render(batch.camera, batch.cam_from_world[views])
+    if not batch.drawn:
+        return seen.rgb
+    rendered = zip(views, seen.rgb, seen.depth_m, strict=True)
+    return np.stack([batch.drawn[view].apply(rgb, batch.camera, depth_m) for view, rgb, depth_m in rendered])
 
 
 def _is_changed(table: pd.DataFrame, seed: int) -> NDArray[np.bool_]:
@@ -279,21 +297,8 @@ def _is_changed(table: pd.DataFrame, seed: int) -> NDArray[np.bool_]:
     return np.array([np.random.default_rng([seed, number]).random() < 0.5 for number in locations.tolist()])[row]
 
 
-def _images(
-    renderer: Renderer, camera: Camera, rows: NDArray[np.int64], cam_from_world: Float, drawn: Sequence[Appearance]
-) -> NDArray[np.uint8]:
-    """Render some rows of all views as images (B, H, W, 3), with their appearances if these are drawn."""
-    seen = renderer.render(camera, cam_from_world[rows])
-    if not drawn:
-        return seen.rgb
-    views = zip(rows, seen.rgb, seen.depth_m, strict=True)
-    return np.stack([drawn[row].apply(rgb, camera, depth_m) for row, rgb, depth_m in views])
-
-
 def _labels(results: Sequence[Localization], true_poses: Float, prefix: str = "") -> dict[str, Any]:
     """Columns of status, errors and inliers, by their names with a prefix."""
-    from wheretolook.localization.localizer import localization_errors
-
     error_m, error_deg = localization_errors(results, true_poses)
     return {
         f"{prefix}status": [result.status for result in results],
@@ -301,12 +306,6 @@ def _labels(results: Sequence[Localization], true_poses: Float, prefix: str = ""
         f"{prefix}error_deg": error_deg.astype(np.float32),
         f"{prefix}n_inliers": np.array([len(result.inlier_rows) for result in results], dtype=np.int32),
     }
-
-
-def _batches(camera: Camera, rows: NDArray[np.int64], batch_size: int) -> list[NDArray[np.int64]]:
-    """Split rows of views of one camera into batches, of `batch_size` if it is 640 x 480."""
-    size = min(batch_size, max(1, batch_size * 640 * 480 // (camera.width * camera.height)))
-    return [rows[i : i + size] for i in range(0, len(rows), size)]
 
 
 def _matches(results: Sequence[Localization], store_pixels: bool) -> dict[str, Any]:

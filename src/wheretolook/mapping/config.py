@@ -7,7 +7,7 @@ from math import inf
 from pathlib import Path
 from typing import Any, ClassVar
 
-from wheretolook.features.config import ExtractorConfig
+from wheretolook.features.extractor import ExtractorConfig
 from wheretolook.geometry.camera import CameraConfig
 from wheretolook.utils.errors import ConfigError, check_positive, check_range, no_option, reject
 

@@ -16,7 +16,7 @@ from wheretolook.geometry.poses import transform
 from wheretolook.geometry.tsdf import DepthImage
 from wheretolook.mapping.colmap_model import read_model
 from wheretolook.utils.errors import SceneError, check_positive
-from wheretolook.utils.files import MAX_DEPTH_PIXELS, load_npy, read_image
+from wheretolook.utils.files import load_npy, read_image
 
 MAX_MEASURED = 50  # images that the scale is measured in
 
@@ -28,7 +28,7 @@ def read_depth(path: Path, scale: float = 1000.0) -> NDArray[np.float32]:
     Raises OSError or ValueError if the file is missing or damaged, SceneError if its values are no depths.
     """
     is_array = path.suffix.lower() == ".npy"
-    image = load_npy(path) if is_array else read_image(path, cv2.IMREAD_UNCHANGED, MAX_DEPTH_PIXELS)
+    image = load_npy(path) if is_array else read_image(path, cv2.IMREAD_UNCHANGED, 25_000_000)  # phones have half of it
     if image.ndim != 2 or image.dtype.kind not in "fui" or image.dtype.itemsize == 1:
         value = f"{image.dtype}, shape {image.shape}"
         raise SceneError("this is no depth image", path=path, value=value, fix="Write one channel of 16 bits as PNG.")

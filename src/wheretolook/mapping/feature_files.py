@@ -13,9 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from wheretolook.features.extractor import DescriptorKind, Stored, unit_descriptors
-from wheretolook.features.registry import all_kinds
-from wheretolook.features.sift import SIFT
+from wheretolook.features.extractor import KINDS, SIFT, DescriptorKind, Stored, unit_descriptors
 from wheretolook.mapping.colmap_model import ModelArrays
 from wheretolook.utils.errors import MapError, MapWarning
 from wheretolook.utils.files import check_file, max_expanded_bytes
@@ -48,7 +46,7 @@ def read_descriptors(
     kind is stated by the database or by the file's name (`feats-disk.h5`); otherwise the number of columns decides:
     64 for XFeat, 256 for SuperPoint, 128 without negatives for SIFT. Images without observations may be missing.
     Returns None, with a `MapWarning`, if the file holds no descriptors, or none of a kind in
-    `wheretolook.features.registry`.
+    `wheretolook.features.extractor`.
 
     Raises MapError if the file is missing, unreadable, or not the one the model was built from, its descriptors are not
     all of one kind, or h5py is missing.
@@ -73,7 +71,7 @@ def read_descriptors(
             without = in_model.name
     if result is None:
         text = (
-            f"{path} holds no descriptors of a known kind ({', '.join(all_kinds())}), so the ambiguity of landmarks is "
+            f"{path} holds no descriptors of a known kind ({', '.join(KINDS)}), so the ambiguity of landmarks is "
             "unknown; scores do without it. If they are of one of these, name it in the file's name: feats-aliked.h5"
         )
         warnings.warn(text, MapWarning, stacklevel=2)
@@ -107,7 +105,7 @@ def read_features(features: str | Path, names: Sequence[str]) -> tuple[Descripto
     stored = []
     for name, image in zip(names, images, strict=True):
         if image.descriptors is None and len(image.keypoints):
-            problem = f"this image has no descriptors of {', '.join(all_kinds())} in this file"
+            problem = f"this image has no descriptors of {', '.join(KINDS)} in this file"
             raise MapError(problem, path=path, value=name, fix="hloc keeps them in HDF5: --database feats-*.h5.")
         descriptors = kind.none() if image.descriptors is None else image.descriptors
         stored.append((image.keypoints.astype(np.float32), descriptors))
@@ -156,7 +154,7 @@ def _check_keypoints(features: _Features, image: Any, path: Path) -> None:
 def kind_in_name(path: Path) -> DescriptorKind | None:
     """The kind of descriptors that a file is named after, as hloc names it."""
     words = re.split(r"[^a-z0-9]+", path.stem.lower())
-    kinds = (kind for name, kind in all_kinds().items() if any(word.startswith(name) for word in words))
+    kinds = (kind for name, kind in KINDS.items() if any(word.startswith(name) for word in words))
     return next(kinds, None)
 
 
@@ -167,7 +165,7 @@ def _kind_by_columns(named: DescriptorKind | None, columns: int) -> DescriptorKi
     """
     if named is not None and named.dimension != columns:
         raise ValueError(f"descriptors of {named.name} have {named.dimension} numbers, not {columns}")
-    kinds = [kind for kind in all_kinds().values() if not kind.in_bytes and kind.dimension == columns]
+    kinds = [kind for kind in KINDS.values() if not kind.in_bytes and kind.dimension == columns]
     if named in kinds:
         return named
     return kinds[0] if len(kinds) == 1 else None
@@ -223,7 +221,7 @@ def _kind_in_table(database: sqlite3.Connection) -> DescriptorKind | None:
                 raise ValueError(f"{name} is not a plain table")
             if str(name).lower() == _KIND_TABLE:
                 row = database.execute(f"SELECT name FROM {_KIND_TABLE}").fetchone()
-                named = all_kinds().get(str(row["name"])) if row else None
+                named = KINDS.get(str(row["name"])) if row else None
     return named
 
 
@@ -231,7 +229,7 @@ def _kind_in_database(colmap_type: int, columns: int, named: DescriptorKind | No
     """The kind of descriptors of so many bytes, from COLMAP's number of their type; -1 if it has none."""
     if colmap_type == -1 and columns != SIFT.columns:
         return _kind_by_columns(named, columns // 4) if columns and columns % 4 == 0 else None
-    kinds = [SIFT] if colmap_type == -1 else all_kinds().values()
+    kinds = [SIFT] if colmap_type == -1 else KINDS.values()
     kind = next((kind for kind in kinds if colmap_type in (-1, kind.colmap_type)), None)
     if kind is not None and not kind.in_bytes and columns not in (0, kind.columns):
         raise ValueError(f"descriptors of {kind.name} take {kind.columns} bytes each, not {columns}")

@@ -11,9 +11,7 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 from tqdm.auto import tqdm
 
-from wheretolook.features.extractor import DescriptorKind, unit_descriptors
-from wheretolook.features.registry import all_kinds
-from wheretolook.features.sift import SIFT
+from wheretolook.features.extractor import KINDS, SIFT, DescriptorKind, unit_descriptors
 from wheretolook.geometry.poses import Float
 from wheretolook.geometry.similarity import local_origin
 from wheretolook.mapping.colmap_model import ModelArrays, model_arrays, read_model, select_points
@@ -67,7 +65,7 @@ class Landmarks:
 
     @property
     def features(self) -> str:
-        """Name in `wheretolook.features.registry` of the descriptors that the map was built with; "" without any."""
+        """Name in `wheretolook.features.extractor` of the descriptors that the map was built with; "" without any."""
         if self.described_by is not None:
             return self.described_by
         return SIFT.name if self.descriptors is not None or np.isfinite(self.ambiguity).any() else ""
@@ -113,7 +111,7 @@ class Landmarks:
         try:
             values = load_npz(Path(path))
             descriptors = values.pop("descriptors", None)
-            kind = all_kinds()[str(values.pop("described_by", SIFT.name))]
+            kind = KINDS[str(values.pop("described_by", SIFT.name))]
             values = _cast_floats(values, np.float64, np.float32)
             return cls(**values, descriptors=descriptors, described_by=None if kind is SIFT else kind.name)
         except (ValueError, KeyError, TypeError) as error:

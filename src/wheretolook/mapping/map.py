@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from wheretolook.features.extractor import DescriptorKind
-from wheretolook.features.sift import SIFT
+from wheretolook.features.extractor import SIFT, DescriptorKind
 from wheretolook.geometry.camera import Camera, cameras_by_id
 from wheretolook.geometry.poses import Float
 from wheretolook.mapping.colmap_model import (

@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
-from wheretolook.features.extractor import DescriptorKind, Stored
-from wheretolook.features.registry import kind_of
+from wheretolook.features.extractor import DescriptorKind, Stored, kind_of
 from wheretolook.geometry.poses import camera_centers
 from wheretolook.geometry.similarity import Similarity
 from wheretolook.mapping.colmap_model import colmap_poses, describe_cameras, read_model, registered_names, write_model

@@ -12,10 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
-from wheretolook.features.config import KeypointExtractor
-from wheretolook.features.extractor import DescriptorKind, Keypoints, Stored
-from wheretolook.features.registry import kind_of
-from wheretolook.features.sift import SIFT
+from wheretolook.features.extractor import SIFT, DescriptorKind, KeypointExtractor, Keypoints, Stored, kind_of
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import camera_centers, transform
 from wheretolook.geometry.similarity import local_origin

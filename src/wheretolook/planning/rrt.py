@@ -18,7 +18,8 @@ from wheretolook.geometry.poses import Float, check_axis
 from wheretolook.geometry.similarity import Similarity
 from wheretolook.mapping.map_frame import IDENTITY
 from wheretolook.planning.config import PathConfig
-from wheretolook.planning.routes import PlannedPath, RouteSamples, RouteViews, between, lengths_along
+from wheretolook.planning.routes import PlannedPath, RouteSamples, RouteViews
+from wheretolook.planning.view_sequence import between, lengths_along
 from wheretolook.planning.viewpoint_map import ViewpointMap
 from wheretolook.utils.errors import PlanningError
 

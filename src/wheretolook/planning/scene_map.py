@@ -156,7 +156,7 @@ def scene_scorer(
         MapError: the map lacks what the method needs.
     """
     if weights is not None and not method:
-        scorer = load_scorer(weights, scene.localization_map, anywhere=anywhere)
+        scorer = load_scorer(scene.localization_map, weights, anywhere=anywhere)
     else:
         scorer = make_scorer(method or FALLBACK, scene.localization_map, weights=weights, anywhere=anywhere)
     return scorer if accuracy is None else scorer.at_accuracy(accuracy)

@@ -21,62 +21,44 @@ from tqdm.auto import tqdm
 
 import wheretolook
 from wheretolook.dataset.config import Accuracy, checked_accuracy
-from wheretolook.features.sift import SIFT
+from wheretolook.features.extractor import SIFT
 from wheretolook.geometry.camera import Camera, ColmapCamera, PinholeCamera, describe_camera
 from wheretolook.geometry.poses import Float
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.landmarks import MAP_ATTRIBUTES, Landmarks
 from wheretolook.scorers.set.accuracy import AccuracyModel
-from wheretolook.scorers.set.network import CELLS, SetNetwork
+from wheretolook.scorers.set.network import CELLS, SetNetwork, ViewSums, expected_parts
 from wheretolook.scorers.set.score import MAX_LANDMARKS, for_map
 from wheretolook.training.trained_network import TrainedNetwork, camera_quantities
 from wheretolook.utils.errors import CameraError, MapError
 from wheretolook.utils.files import atomic_write, copy_file, save_npz, sha256, write_bytes, write_json, write_text
 from wheretolook.utils.package import VERSION
 
-OPSET = 17  # of 2022: onnxruntime 1.12 and later reads the file
-IR_VERSION = 8
-INPUTS = ("values", "taken", "n_visible", "axis_height")
-OUTPUTS = ("probability", "expected_inliers")
 
-
-def pose_variances(information: Tensor) -> tuple[Tensor, Tensor]:
+def pose_variances(information: Tensor) -> Tensor:
     """Invert information matrices (B, 6, 6) by Gauss-Jordan elimination, since ONNX has no Cholesky decomposition.
 
-    Returns the diagonals of the inverses (B, 6) and the logarithms of the determinants (B,). Positive definite matrices
-    need no pivoting.
+    Returns the diagonals of the inverses (B, 6). Positive definite matrices need no pivoting.
     """
     unit = torch.eye(6, dtype=information.dtype)
     rows = torch.cat([information, unit.expand_as(information)], dim=-1)
-    log_det = torch.zeros_like(information[:, 0, 0])
     for k in range(6):
         pivot = rows[:, k, k]
-        log_det = log_det + pivot.log()
         row = (rows[:, k] / pivot[:, None])[:, None]
         rows = torch.where(unit[k, :, None] > 0, row, rows - rows[:, :, k, None] * row)
-    return (rows[:, :, 6:] * unit).sum(-1), log_det
-
-
-TAIL = (
-    0.17087277,
-    -0.82215223,
-    1.48851587,
-    -1.13520398,
-    0.27886807,
-    -0.18628806,
-    0.09678418,
-    0.37409196,
-    1.00002368,
-    -1.95865941,
-)
-"""Polynomial in the log of half the complementary error function, within 1.2e-7 (Numerical Recipes in C, 6.2)."""
+    return (rows[:, :, 6:] * unit).sum(-1)
 
 
 def log_ndtr(x: Tensor) -> Tensor:
-    """Return the log of the standard normal distribution function at x (...), which ONNX lacks."""
+    """Return the log of the standard normal distribution function at x (...), which ONNX lacks.
+
+    By a polynomial in the log of half the complementary error function, within 1.2e-7 (Numerical Recipes in C, 6.2).
+    """
+    falling = (0.17087277, -0.82215223, 1.48851587, -1.13520398, 0.27886807)
+    coefficients = (*falling, -0.18628806, 0.09678418, 0.37409196, 1.00002368, -1.95865941)
     t = 1 / (1 + x.abs() / sqrt(8))
     polynomial = torch.zeros_like(t)
-    for coefficient in TAIL:
+    for coefficient in coefficients:
         polynomial = polynomial * t + coefficient
     below = t.log() - x * x / 2 + polynomial  # at -|x|
     return torch.where(x > 0, torch.log1p(-below.exp()), below)
@@ -99,16 +81,13 @@ class RobotNetwork(nn.Module):
         single = np.where(single < exact, np.nextafter(single, np.float32(np.inf)), single)
         self.register_buffer("borders", torch.from_numpy(single))
 
-    def forward(
-        self, values: Tensor, n_sampled: Tensor, n_visible: Tensor, axis_height: Tensor
-    ) -> tuple[Tensor, Tensor]:
+    def forward(self, values: Tensor, n_sampled: Tensor, n_visible: Tensor) -> tuple[Tensor, Tensor]:
         """Score B views.
 
         Args:
             values: (B, K, A) float32, attributes of at most K landmarks of each view.
             n_sampled: (B,) int64, number of these landmarks that are the view's.
             n_visible: (B,) int64, number of visible landmarks.
-            axis_height: (B,) float32, z of the optical axis in the world.
 
         Returns:
             Probabilities to localize (B,) float64 and expected inliers (B,) float32.
@@ -117,14 +96,14 @@ class RobotNetwork(nn.Module):
         log_odds = network.matchability(values)
         own = torch.arange(values.shape[1]) < n_sampled[:, None]
         each = (n_visible.double() / n_sampled.clamp(min=1))[:, None]  # visible landmarks per sampled one
-        sums = (network.parts(values, log_odds).double() * own[..., None]).sum(1) * each
+        sums = (expected_parts(values, log_odds, network.attributes).double() * own[..., None]).sum(1) * each
         is_own = self.accuracy == self.trained.accuracy
-        cells = self._expected_cells(values, log_odds, own, each) if network.needs_cells or not is_own else None
-        view = sums, n_visible, axis_height, cells
-        probability = self.trained.calibrated(network.logits(*view).double()).sigmoid()
+        views = ViewSums(sums, n_visible, self._expected_cells(values, log_odds, own, each))
+        probability = self.trained.calibrated(network.logits(views).double()).sigmoid()
         if not is_own:
-            known = self.trained.accuracy, probability, network.statistics_of(*view).double()
-            probability = AccuracyModel.bundled().at(self.accuracy, *known, torch, log_ndtr)
+            statistics = network.statistics_of(views).double()
+            model = AccuracyModel.bundled()
+            probability = model.at(self.accuracy, self.trained.accuracy, probability, statistics, torch, log_ndtr)
         return probability, sums[:, 0].float()
 
     def _expected_cells(self, values: Tensor, log_odds: Tensor, own: Tensor, each: Tensor) -> Tensor:
@@ -142,28 +121,29 @@ class RobotNetwork(nn.Module):
 def set_graph(trained: TrainedNetwork[SetNetwork], accuracy: Accuracy) -> Any:
     """Return the `onnx.ModelProto` of a `RobotNetwork`, with its inputs and outputs."""
     example = (torch.zeros(2, 3, len(trained.network.attributes)), torch.tensor([3, 2]), torch.tensor([5, 2]))
-    axes = {name: {0: "B"} for name in (*INPUTS, *OUTPUTS)}
+    inputs = ("values", "taken", "n_visible")
+    outputs = ("probability", "expected_inliers")
+    axes = {name: {0: "B"} for name in (*inputs, *outputs)}
     axes["values"] = {0: "B", 1: "K"}
     file: Any = io.BytesIO()
     with warnings.catch_warnings(action="ignore"):  # the default exporter needs another package
         torch.onnx.export(
             RobotNetwork(trained, accuracy),
-            (*example, torch.zeros(2)),
+            example,
             file,
             dynamo=False,
-            opset_version=OPSET,
-            input_names=INPUTS,
-            output_names=OUTPUTS,
+            opset_version=17,  # of 2022: onnxruntime 1.12 and later reads the file
+            input_names=inputs,
+            output_names=outputs,
             dynamic_axes=axes,
         )
     model = onnx.load_from_string(file.getvalue())
-    model.ir_version = IR_VERSION
+    model.ir_version = 8
     onnx.checker.check_model(model, full_check=True)
     return model
 
 
 PACKAGE = "wheretolook_localization"  # of the copies, so that an installed wheretolook does not replace them
-FIRST = "wheretolook.robot.localizer", "wheretolook.planning.routes"
 ROOT = Path(wheretolook.__file__).parent
 
 
@@ -201,9 +181,9 @@ def _path(module: str) -> Path | None:
 
 
 def _modules() -> set[str]:
-    """Return the names of the modules to copy: `FIRST`, and what they import."""
+    """Return the names of the modules to copy: the localizer, the planner of views along a path, and what they import."""
     found: set[str] = set()
-    left = [*FIRST]
+    left = ["wheretolook.robot.localizer", "wheretolook.planning.view_sequence"]
     while left:
         name = left.pop()
         path = _path(name)
@@ -220,12 +200,6 @@ def _imports(node: ast.AST) -> Iterator[str]:
     if not (isinstance(node, ast.If) and isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING"):
         for child in ast.iter_child_nodes(node):
             yield from _imports(child)
-
-
-FORMAT_VERSION = 1  # of the folder, as in wheretolook_robot.py
-RECTIFIED = {"SIMPLE_RADIAL": 1, "RADIAL": 1, "OPENCV": 2, "FULL_OPENCV": 2}
-"""Number of focal lengths of COLMAP's perspective models with distortion."""
-BLOCK = 64  # locations per call of the occlusion model
 
 
 def export_robot(
@@ -291,7 +265,7 @@ def _description(trained: TrainedNetwork[SetNetwork], camera: PinholeCamera, acc
     """Describe camera, inputs, accuracy and training range of a network for robot.json."""
     training_range = trained.range_at(accuracy)
     return {
-        "format_version": FORMAT_VERSION,
+        "format_version": 1,  # of the folder, as in wheretolook_robot.py
         "wheretolook": VERSION,
         "camera": {name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")},
         "attributes": list(trained.network.attributes),
@@ -310,8 +284,9 @@ def pinhole_of(camera: Camera) -> PinholeCamera:
     """
     if isinstance(camera, PinholeCamera):
         return camera
-    if isinstance(camera, ColmapCamera) and camera.model in RECTIFIED:
-        focal = camera.params[: RECTIFIED[camera.model]]
+    focal_lengths = {"SIMPLE_RADIAL": 1, "RADIAL": 1, "OPENCV": 2, "FULL_OPENCV": 2}  # perspective, with distortion
+    if isinstance(camera, ColmapCamera) and camera.model in focal_lengths:
+        focal = camera.params[: focal_lengths[camera.model]]
         return PinholeCamera(camera.width, camera.height, focal[0], focal[-1], camera.principal_point)
     fix = "Give the pinhole of the robot's rectified images by --camera."
     raise CameraError("this camera model has no pinhole", value=describe_camera(camera), fix=fix)
@@ -322,7 +297,7 @@ def _unoccluded(localization_map: LocalizationMap, places: Float, progress: bool
     points = localization_map.landmarks.points
     packed = np.empty((len(places), (len(points) + 7) // 8), dtype=np.uint8)
     hidden = not progress or len(places) == 0
-    for begin in tqdm(range(0, len(places), BLOCK), desc="occlusion", unit=f"{BLOCK} places", disable=hidden):
-        rows = slice(begin, begin + BLOCK)
+    for begin in tqdm(range(0, len(places), 64), desc="occlusion", unit="64 places", disable=hidden):
+        rows = slice(begin, begin + 64)
         packed[rows] = np.packbits(localization_map.occlusion.unoccluded(places[rows], points), axis=1)
     return packed

@@ -52,12 +52,8 @@ from wheretolook.localization.rig_localization import (
 from wheretolook.looks.next_look import DirectionScorer, NextLook, NextLookSelector
 from wheretolook.utils.errors import ConfigError
 
-FORMAT_VERSION = 1  # of the folder, as in export.py
 GROUP = 32  # landmarks; the best groups are selected first, and in them the best landmarks
 NEAREST = 16  # landmarks of each keypoint
-BLOCK = 256  # keypoints compared at a time
-MAX_FOCAL_RATIO = 1.5  # between a camera and that of the folder
-TURN_NOISE_DEG = 0.2  # of given rotations, one standard deviation about each axis
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,11 +104,11 @@ class RobotLocalizer:
     Raises OSError or ValueError if a file cannot be used.
     """
 
-    def __init__(self, folder: str | Path, turn_noise_deg: float = TURN_NOISE_DEG, in_world: bool = False) -> None:
+    def __init__(self, folder: str | Path, turn_noise_deg: float = 0.2, in_world: bool = False) -> None:
         folder = Path(folder)
         about = json.loads((folder / "robot.json").read_text(encoding="utf-8"))
-        if about.get("format_version") != FORMAT_VERSION:
-            raise ValueError(f"{folder}: this program reads format {FORMAT_VERSION}. Export again.")
+        if about.get("format_version") != 1:
+            raise ValueError(f"{folder}: this program reads format 1. Export again.")
         self._world_from_map = Similarity(1.0, np.eye(3), np.zeros(3))
         if not in_world:
             frame = about["world_from_map"]
@@ -120,8 +116,8 @@ class RobotLocalizer:
             self._world_from_map = Similarity(float(frame["scale"]), rotation, np.array(frame["translation"]))
         camera = about["camera"]
         centre = camera["cx"], camera["cy"]
-        size = int(camera["width"]), int(camera["height"])
-        self.camera = PinholeCamera(*size, camera["fx"], camera["fy"], centre)
+        width, height = int(camera["width"]), int(camera["height"])
+        self.camera = PinholeCamera(width, height, camera["fx"], camera["fy"], centre)
         with np.load(folder / "landmarks.npz", allow_pickle=False) as stored:
             points = stored["points"]
             distance = stored["attributes"][:, about["map_attributes"].index("mapped_distance")]
@@ -160,7 +156,7 @@ class RobotLocalizer:
     def difference(self, camera: PinholeCamera) -> str:
         """Describe how much the focal length of a camera differs from the folder's; empty if that hardly matters."""
         ratio = camera.fx / camera.width * self.camera.width / self.camera.fx
-        if 1 / MAX_FOCAL_RATIO < ratio < MAX_FOCAL_RATIO:
+        if 1 / 1.5 < ratio < 1.5:
             return ""
         return f"the focal length, relative to the width, is {ratio:.2f} times that of the map's camera"
 
@@ -248,7 +244,7 @@ class RobotLocalizer:
         self, descriptors: NDArray[np.uint8], count: int = NEAREST
     ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
         """Find the nearest landmarks of descriptors (K, 128): rows and squared distances, ascending, (K, count)."""
-        parts = [self._nearest(descriptors[row : row + BLOCK], count) for row in range(0, len(descriptors), BLOCK)]
+        parts = [self._nearest(descriptors[row : row + 256], count) for row in range(0, len(descriptors), 256)]
         return np.concatenate([part[0] for part in parts]), np.concatenate([part[1] for part in parts])
 
     def _nearest(self, descriptors: NDArray[np.uint8], count: int) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
@@ -269,11 +265,6 @@ class RobotLocalizer:
             return pose.covariance
         to_map = np.kron(np.diag([1 / self._world_from_map.scale, 1]), self._world_from_map.rotation.T)
         return to_map @ pose.covariance @ to_map.T
-
-
-MIN_TURN_DEG = 20.0  # between views that are localized jointly
-DRIFT = 0.25, 5.0  # m and degrees by which odometry may disagree with two confident poses,
-DRIFT_RATE = 0.1  # plus this share of the distance between them
 
 
 @dataclass(frozen=True, eq=False)
@@ -365,14 +356,17 @@ class ImageSequence:
     def _joins(self, earlier: Float, now: Float) -> bool:
         """Whether a camera pose is near enough to another, and looks elsewhere."""
         moved = np.linalg.norm(camera_centers(earlier) - camera_centers(now))
-        return bool(moved <= self.max_move_m and rotation_angle_deg(earlier[:, :3], now[:, :3]) >= MIN_TURN_DEG)
+        return bool(moved <= self.max_move_m and rotation_angle_deg(earlier[:, :3], now[:, :3]) >= 20.0)
 
 
 def _contradiction(map_before: Float, odom_before: Float, map_now: Float, odom_now: Float) -> str:
-    """Describe by how much odometry and localization disagree on a motion, empty if within `DRIFT`."""
+    """Describe by how much odometry and localization disagree on a motion.
+
+    Empty if within 5 degrees, and 25 cm and a tenth of the distance.
+    """
     now_from_before = compose_poses(odom_now, invert_poses(odom_before))
     error_m, error_deg = pose_error(compose_poses(now_from_before, map_before), map_now)
     distance = np.linalg.norm(camera_centers(odom_now) - camera_centers(odom_before))
-    if error_m <= DRIFT[0] + DRIFT_RATE * distance and error_deg <= DRIFT[1]:
+    if error_m <= 0.25 + 0.1 * distance and error_deg <= 5.0:
         return ""
     return f"odometry contradicts the images by {error_m:.2f} m and {error_deg:.1f} degrees"

@@ -51,14 +51,10 @@ import onnxruntime
 from numpy.typing import ArrayLike, NDArray
 
 FORMAT_VERSION = 1  # of the folder
-MIN_DEPTH_M = 2.0**-10  # landmarks with a smaller depth are not visible
 CAMERA = ("width", "height", "fx", "fy", "cx", "cy")
 COMPUTED = {"across", "down", "distance", "mapped_angle", "distance_ratio", "pixel_angle", "pixel_size_ratio"}
-INPUTS = {"values", "taken", "n_visible", "axis_height"}
 OUTPUTS = ("probability", "expected_inliers")
 FREE_BYTES = 128_000_000  # that landmarks.npz may expand to, whatever its size
-MAX_RATIO = 100  # of its expanded to its stored bytes
-BLOCK = 1 << 15  # landmarks per call of the network, which fit into the cache
 
 Array = NDArray[Any]
 
@@ -117,7 +113,8 @@ class RobotScorer:
             self._session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
             shapes = {value.name: value.shape for value in self._session.get_inputs()}
             outputs = {value.name for value in self._session.get_outputs()}
-            if {*shapes} != INPUTS or shapes["values"][-1] != len(self._names) or not {*OUTPUTS} <= outputs:
+            inputs = {"values", "taken", "n_visible"}
+            if {*shapes} != inputs or shapes["values"][-1] != len(self._names) or not {*OUTPUTS} <= outputs:
                 raise ValueError("it is of another network")
         except Exception as error:  # onnxruntime raises errors of many kinds
             raise ValueError(f"{path}: the network cannot be read: {error}. Export again.") from error
@@ -163,7 +160,7 @@ class RobotScorer:
         try:
             with np.load(path, allow_pickle=False) as stored:
                 n_bytes = sum(member.file_size for member in stored.zip.infolist())
-                if n_bytes > max(FREE_BYTES, MAX_RATIO * path.stat().st_size):
+                if n_bytes > max(FREE_BYTES, 100 * path.stat().st_size):
                     raise ValueError(f"it would expand to {n_bytes:,} bytes")
                 arrays = {name: stored[name] for name in (*shapes, "places", "unoccluded")}
             shapes |= {"places": (len(arrays["places"]), 3), "unoccluded": (len(arrays["places"]), (n + 7) // 8)}
@@ -283,7 +280,6 @@ class RobotScorer:
                 if len(rows):
                     distance_m[view] = np.exp(own[:, distance].mean())
             inputs = {"values": padded, "taken": counts, "n_visible": n_visible[block]}
-            inputs["axis_height"] = rotations[block, 2, 2].astype(np.float32)
             score[block], inliers[block] = self._session.run(OUTPUTS, inputs)
         in_range = self._serves_camera & self._within("distance_m", distance_m)
         in_range &= (n_visible == 0) | self._within("in_view", n_visible)
@@ -322,7 +318,7 @@ class RobotScorer:
                 forward,
             ])  # fmt: skip
             a, b, d, e, depth = sides.astype(np.float32).astype(np.float64) @ precise
-            visible.append(np.flatnonzero((a >= 0) & (b > 0) & (d >= 0) & (e > 0) & (depth > MIN_DEPTH_M)))
+            visible.append(np.flatnonzero((a >= 0) & (b > 0) & (d >= 0) & (e > 0) & (depth > 2.0**-10)))
         return visible
 
     def _values(self, offsets: Array, rows: Array) -> Array:
@@ -359,7 +355,8 @@ class RobotScorer:
         order = np.argsort(counts, kind="stable")[::-1]
         begin = 0
         while begin < len(order):
-            end = begin + max(1, BLOCK // max(1, int(counts[order[begin]])))
+            # 32,768 landmarks per call of the network fit into the cache
+            end = begin + max(1, (1 << 15) // max(1, int(counts[order[begin]])))
             yield order[begin:end]
             begin = end
 

@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import base64
 import hashlib
 import io
+import itertools
+import math
+import os
+import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
 from os import PathLike
@@ -17,9 +22,9 @@ from PIL import Image
 
 from wheretolook.geometry.mesh import TexturedMesh
 from wheretolook.geometry.similarity import local_origin
-from wheretolook.scenes.mesh_checks import check_mesh_file
+from wheretolook.utils.devices import fitting
 from wheretolook.utils.errors import SceneError, check_choice, check_range
-from wheretolook.utils.files import write_bytes
+from wheretolook.utils.files import image_size, max_expanded_bytes, parse_json_object, read_text, write_bytes
 
 # Rotations that turn the named axis of a file into the world's z axis.
 _Z_UP_FROM = {
@@ -30,9 +35,6 @@ _Z_UP_FROM = {
     "z": [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
     "-z": [[1, 0, 0], [0, -1, 0], [0, 0, -1]],
 }
-_SUFFIXES = (".glb", ".ply", ".obj")
-_MIN_AREA_M2 = 1e-12  # a square of a thousandth of a millimetre
-_MIN_EXTENT_M = 1e-3
 _WHITE = np.full((1, 1, 3), 255, dtype=np.uint8)
 
 
@@ -63,7 +65,7 @@ def load_mesh(path: str | PathLike[str], up: str = "z", colored: bool = True) ->
     """
     check_choice("up axis", up, _Z_UP_FROM)
     file = _mesh_file(Path(path))
-    check_mesh_file(file)
+    _check_file(file)
     try:
         scene = trimesh.load_scene(str(file), process=False)
         parts = list(_parts(scene))
@@ -104,10 +106,110 @@ def glb_bytes(mesh: TexturedMesh, jpeg_quality: int = 90) -> bytes:
 def _mesh_file(path: Path) -> Path:
     """The mesh file of a path, which may be a Habitat-Matterport folder. Raises SceneError if there is none."""
     file = path / f"{path.name.partition('-')[2]}.glb" if path.is_dir() else path
-    if not file.is_file() or file.suffix.lower() not in _SUFFIXES:
-        fix = f"Give an existing file {', '.join(_SUFFIXES)}, or a Habitat-Matterport folder <id>-<name>"
+    if not file.is_file() or file.suffix.lower() not in (".glb", ".ply", ".obj"):
+        fix = "Give an existing file .glb, .ply, .obj, or a Habitat-Matterport folder <id>-<name>"
         raise SceneError("there is no mesh", path=file, fix=fix)
     return file
+
+
+def _check_file(path: Path) -> None:
+    """Raise SceneError for a texture that is missing, unreadable or too large, or for parts that do not fit into memory.
+
+    trimesh omits textures that it cannot read, or replaces them by a grey placeholder, without an error.
+    """
+    list_textures = {".glb": _glb_textures, ".ply": _ply_textures, ".obj": _obj_textures}[path.suffix.lower()]
+    try:
+        n_pixels = sum(math.prod(image_size(texture)) for texture in dict.fromkeys(list_textures(path)))
+    except (ValueError, OSError, KeyError, IndexError, TypeError, AttributeError, struct.error) as error:
+        problem = f"the file or a texture is truncated, corrupt or too large: {type(error).__name__}: {error}"
+        raise SceneError(problem, path=path, fix="Copy or export the scene again.") from error
+    limit = fitting(11)  # bytes of a pixel while it is read
+    if n_pixels > limit:
+        fix = f"Scale them down: {limit:,} pixels fit into memory."
+        raise SceneError("the textures are too large together", path=path, value=f"{n_pixels:,} pixels", fix=fix)
+
+
+def _sibling(path: Path, name: str) -> Path:
+    """A file that a mesh names. Raises SceneError unless it exists, in the mesh's folder or a subfolder."""
+    file = path.parent / name
+    if not Path(os.path.normpath(file)).is_relative_to(os.path.normpath(path.parent)) or not file.is_file():
+        fix = "Put it into the mesh's folder, under the name that the mesh gives it."
+        raise SceneError("a file of the scene is missing, or outside of its folder", path=path, value=name, fix=fix)
+    return file
+
+
+def _glb_textures(path: Path) -> Iterator[Path | bytes]:
+    """Images of a binary glTF 2.0 file (specification, section 4.4): sibling files, or their content.
+
+    Raises ValueError for what makes trimesh run for minutes or fill the memory: many parts, and accessors without data.
+    """
+    content = path.read_bytes()
+    json_length, _ = struct.unpack_from("<II", content, 12)
+    tree = parse_json_object(content[20 : 20 + json_length].decode())
+    accessors = tree.get("accessors", [])
+    for accessor in accessors:
+        if "bufferView" not in accessor and accessor["count"] > max_expanded_bytes(len(content)) // 64:  # 4 x 4 numbers
+            raise ValueError(f"an accessor without data has {accessor['count']} elements")
+    meshes = [mesh["primitives"] for mesh in tree.get("meshes", [])]
+    shown = [meshes[node["mesh"]] for node in tree.get("nodes", []) if "mesh" in node]
+    if sum(map(len, meshes + shown)) > 40_000:  # trimesh takes 0.3 ms for each
+        raise ValueError("its meshes and nodes have more than 40,000 parts; join them")
+    n_corners = 0
+    for part in itertools.chain(*shown):
+        n_corners += accessors[part.get("indices", part["attributes"]["POSITION"])]["count"]
+    if n_corners > fitting(200):  # bytes of a corner while it is read
+        raise ValueError(f"its nodes have {n_corners // 3:,} triangles together")
+    buffers = [content[28 + json_length :]]
+    for buffer in tree.get("buffers", []):
+        source = _at_uri(buffer["uri"], path) if "uri" in buffer else buffers[0]
+        buffers.append(source.read_bytes() if isinstance(source, Path) else source)
+    for image in tree.get("images", []):
+        if "bufferView" in image:
+            view = tree["bufferViews"][image["bufferView"]]
+            start = view.get("byteOffset", 0)
+            yield buffers[1 + view["buffer"]][start : start + view["byteLength"]]
+        else:
+            yield _at_uri(image["uri"], path)
+
+
+def _at_uri(uri: str, path: Path) -> Path | bytes:
+    """The file, or the content of a `data:` URI, that the mesh at `path` names."""
+    kind, _, content = uri.partition(",")
+    if not kind.startswith("data:"):
+        return _sibling(path, uri)
+    if not kind.endswith(";base64"):
+        raise ValueError(f"a URI without base64, {kind[:40]!r}")
+    return base64.b64decode(content, validate=True)
+
+
+def _ply_textures(path: Path) -> Iterator[Path | bytes]:
+    """Textures that a PLY file names in comments."""
+    with path.open("rb") as file:
+        header = file.read(1 << 16).partition(b"end_header")[0]
+    for line in header.decode("utf-8", errors="replace").splitlines():
+        if line.lower().startswith("comment texturefile "):
+            yield _sibling(path, line.strip()[len("comment texturefile ") :].strip())
+
+
+def _obj_textures(path: Path) -> Iterator[Path | bytes]:
+    """Textures that an OBJ file's materials name. Raises ValueError if the file has too many parts."""
+    parts = dict.fromkeys(("usemtl", "o", "g"), 0)
+    libraries = []
+    with path.open(encoding="utf-8", errors="replace") as file:
+        for line in file:
+            if line.startswith("mtllib "):
+                libraries.append(line[7:].strip())
+            elif line.startswith(("usemtl ", "o ", "g ")):
+                parts[line.split(maxsplit=1)[0]] += 1
+    if max(parts.values()) > 5000:  # trimesh takes the square of their number
+        raise ValueError(f"{max(parts.values()):,} parts; join them to 5,000, or export a GLB file")
+    for name in libraries:
+        library = _sibling(path, name)
+        for line in read_text(library).splitlines():
+            # A map with options (-s, -o ...) before its file name is not checked.
+            words = line.split(maxsplit=1)
+            if len(words) == 2 and words[0].lower() == "map_kd" and not words[1].startswith("-"):
+                yield _sibling(library, words[1].strip().replace("\\", "/"))
 
 
 def _parts(scene: trimesh.Scene) -> Iterator[_Part]:
@@ -223,12 +325,12 @@ def _cleaned(mesh: TexturedMesh, path: Path) -> TexturedMesh:
     if not all(finite):
         what = "texture coordinates" if finite[0] else "vertices"
         raise SceneError(f"some {what} are NaN or infinite", path=path, fix="Clean the mesh, for instance in MeshLab")
-    keep = 0.5 * np.linalg.norm(mesh.normals, axis=1) > _MIN_AREA_M2
+    keep = 0.5 * np.linalg.norm(mesh.normals, axis=1) > 1e-12  # m^2: a square of a thousandth of a millimetre
     if not keep.any():
         raise SceneError("all triangles are degenerate", path=path, value=len(keep), fix="Check the export")
     cleaned = mesh.only(keep)
     extent = np.ptp(cleaned.bounds, axis=0)
-    if (extent < _MIN_EXTENT_M).any():
+    if (extent < 1e-3).any():
         fix = "A scene needs an extent in x, y and z, in metres"
         raise SceneError("the mesh is flat", path=path, value=extent.tolist(), fix=fix)
     return cleaned

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, overload
+from typing import TYPE_CHECKING
 
 from wheretolook.scorers.registry import SUBSTITUTES, BuildOptions, build_scorer, check_method, members, scorers
 from wheretolook.training.weights import method_of_weights, preference, read_training, read_weights
@@ -80,20 +80,8 @@ def weights_by_method(path: str | Path, features: str = "") -> dict[str, Path]:
     return files
 
 
-@overload
-def load_scorer(localization_map: LocalizationMap, /) -> Scorer: ...
-
-
-@overload
-def load_scorer(weights: str | Path | None, localization_map: LocalizationMap, anywhere: bool = False) -> Scorer: ...
-
-
-def load_scorer(
-    weights: str | Path | LocalizationMap | None = None,
-    localization_map: LocalizationMap | None = None,
-    anywhere: bool = False,
-) -> Scorer:
-    """Return the learned scorer of a map: `load_scorer(map).score(cam_from_world)`, or `load_scorer(weights, map)`.
+def load_scorer(localization_map: LocalizationMap, weights: str | Path | None = None, anywhere: bool = False) -> Scorer:
+    """Return the learned scorer of a map: `load_scorer(localization_map).score(cam_from_world)`.
 
     `weights` are a file that the train command wrote, whose header names the method, or a folder of such files, of
     which `resolve_weights` takes the best; None for the bundled ones. A path such as `data/release/weights` names
@@ -104,11 +92,6 @@ def load_scorer(
         CameraError: they were trained for another field of view than the map's camera.
         MapError: the map lacks what the method needs.
     """
-    if weights is not None and not isinstance(weights, (str, Path)):
-        weights, localization_map = None, weights
-    if localization_map is None:
-        fix = "Call load_scorer(localization_map), or load_scorer(weights, localization_map)."
-        raise ConfigError("a scorer needs a map", fix=fix)
     path = resolve_weights(path=weights, features=localization_map.landmarks.features)
     assert path is not None
     method = check_method(method_of_weights(path))

@@ -14,10 +14,8 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import csr_array
 
 from wheretolook.dataset.config import ACCURACY, Accuracy, checked_accuracy
-from wheretolook.features.config import ExtractorConfig
-from wheretolook.features.extractor import Keypoints
+from wheretolook.features.extractor import ExtractorConfig, Keypoints, kind_of, runnable_extractors
 from wheretolook.features.matches import Matches
-from wheretolook.features.registry import kind_of, runnable_extractors
 from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.poses import Float
 from wheretolook.localization.confidence import probabilities

@@ -13,8 +13,9 @@ from wheretolook.geometry.views import Views
 from wheretolook.inputs.landmark_features import ReasonCounter
 from wheretolook.looks.selection import best_views, separated
 from wheretolook.planning.config import StopConfig
-from wheretolook.planning.routes import PlannedPath, TurnLimit, best_sequence
+from wheretolook.planning.routes import PlannedPath
 from wheretolook.planning.stops import stops_along
+from wheretolook.planning.view_sequence import TurnLimit, best_sequence
 from wheretolook.scorers.base import Scorer
 from wheretolook.select.waypoints import SelectionRequest, Waypoints, usable_waypoints
 from wheretolook.utils.errors import ConfigError

@@ -121,7 +121,7 @@ class WhereToLook:
         here = scene.localization_map
         weights = resolve_weights(method, weights, here.landmarks.features)
         if not method:
-            return cls(load_scorer(weights, here, anywhere), axes, scene.space, files)
+            return cls(load_scorer(here, weights, anywhere), axes, scene.space, files)
         return cls(make_scorer(method, here, weights=weights, anywhere=anywhere), axes, scene.space, files)
 
     @property

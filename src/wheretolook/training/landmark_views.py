@@ -42,7 +42,6 @@ class LandmarkViews(TensorViews):
     starts: Tensor  # (B + 1,) int64; view b has entries `starts[b]` to `starts[b + 1]`
     values: Tensor  # (E, len(ATTRIBUTES)) float16
     n_visible: Tensor  # (B,) int64, landmarks visible from each view
-    axis_height: Tensor  # (B,) float32, z of the optical axis in the world
     labels: Tensor  # (B,) float32, 1 where the viewpoint localizes
     error_m: Tensor  # (B,) float32, position error; infinite where it is not localized or its orientation is off
     scene: NDArray[np.int64]  # (B,) index of each view's scene in the order given
@@ -100,7 +99,6 @@ def load_landmark_views(
         starts=starts,
         values=values,
         n_visible=n_visible,
-        axis_height=torch.from_numpy(poses(table)[:, 2, 2].astype(np.float32)),
         labels=torch.from_numpy(good.astype(np.float32)),
         error_m=torch.from_numpy(error_m.astype(np.float32)),
         scene=table["scene"].to_numpy(),
@@ -179,8 +177,7 @@ class LandmarkBatches(IndexBatches):
         detected = torch.full(entries.shape, torch.nan, device=rows.device)
         if views.detected is not None:
             detected = torch.where(steps < n_sampled[:, None], views.detected[entries].float(), detected)
-        known = (n_sampled, views.n_visible[share], views.axis_height[share], detected)
-        return Batch((values, *known), labels, len(rows))
+        return Batch((values, n_sampled, views.n_visible[share], detected), labels, len(rows))
 
 
 def random_log_scales(count: int, max_scale: float, generator: torch.Generator) -> Tensor | None:

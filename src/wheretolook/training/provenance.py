@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from wheretolook.dataset.config import RELEASE_FILE
 from wheretolook.dataset.layout import Dataset, SceneFolder
-from wheretolook.features.sift import SIFT
+from wheretolook.features.extractor import SIFT
 from wheretolook.tracking import AUC
 from wheretolook.training.config import DECIDING, SharedConfig
 from wheretolook.training.scenes import with_also

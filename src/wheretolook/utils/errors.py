@@ -7,10 +7,7 @@ import difflib
 from collections.abc import Iterable, Mapping
 from math import degrees, inf, pi
 from os import PathLike
-from typing import TYPE_CHECKING, Any, TypeVar
-
-if TYPE_CHECKING:
-    from _typeshed import DataclassInstance
+from typing import Any, TypeVar
 
 
 class WhereToLookError(Exception):
@@ -187,12 +184,13 @@ def no_option(default: Any) -> Any:
     return dataclasses.field(default=default, metadata={"option": False})
 
 
-T = TypeVar("T", bound="DataclassInstance")
+T = TypeVar("T")
 
 
 def from_record(settings: type[T], values: Mapping[str, Any]) -> T:
     """Return settings that `dataclasses.asdict` recorded. Raises ConfigError if a constant had another value."""
-    fixed = {field.name for field in dataclasses.fields(settings) if not field.init}
+    dataclass: Any = settings
+    fixed = {field.name for field in dataclasses.fields(dataclass) if not field.init}
     for name in fixed & {*values}:
         if values[name] != getattr(settings, name):
             fix = f"Make the result again: {name} is {getattr(settings, name)} now."

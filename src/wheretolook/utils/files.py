@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     import pyarrow.parquet as pq
 
 STORAGE_FIX = "Free disk space, fix permissions or name another folder, then run again; finished work is kept."
-MAP_FILES = ("cameras", "images", "points3D", "rigs", "frames", "landmarks")  # without endings
 
 
 def write_json(path: Path, content: Any) -> None:
@@ -61,7 +60,8 @@ def copy_file(source: Path, target: Path) -> None:
 def check_output(path: Path, inputs: Iterable[Path] = ()) -> None:
     """Raise ConfigError for an output that is a device, pipe, link to a file, an input or its map, or in a dataset."""
     target = Path(os.path.realpath(path))
-    replaced = {target, target.parent if target.stem in MAP_FILES else target}
+    of_map = target.stem in ("cameras", "images", "points3D", "rigs", "frames", "landmarks")
+    replaced = {target, target.parent if of_map else target}
     is_special = os.path.lexists(path) and not path.is_dir() and (path.is_symlink() or not path.is_file())
     in_dataset = any((folder / "dataset.json").is_file() for folder in (target, *target.parents))
     if is_special or in_dataset or replaced & {Path(os.path.realpath(given)) for given in inputs}:
@@ -219,10 +219,6 @@ def path_within(folder: Path, name: str, whose: str) -> Path:
 
 
 MAX_TEXT_BYTES = 16_000_000  # of a JSON file: a hundred thousand photographs or shards
-MAX_JSON_VALUES = 1_500_000  # an empty list takes three bytes of a file and eighty of memory
-MAX_YAML_BYTES = 100_000
-MAX_RATIO = 100  # of expanded to stored bytes of arrays and tables; occlusion of the bundled maps has 8, a bomb 1032
-FREE_BYTES = 128_000_000  # that any file of arrays may expand to
 
 
 def check_file(path: Path, pipes: bool = False) -> os.stat_result:
@@ -238,8 +234,11 @@ def check_file(path: Path, pipes: bool = False) -> os.stat_result:
 
 
 def max_expanded_bytes(n_bytes: int) -> int:
-    """Return how many bytes a file of arrays or a table of `n_bytes` may expand to in memory."""
-    return max(FREE_BYTES, MAX_RATIO * n_bytes)
+    """Return how many bytes a file of arrays or a table of `n_bytes` may expand to in memory.
+
+    A hundred times its size: the occlusion of the bundled maps expands by 8, a bomb by 1032.
+    """
+    return max(128_000_000, 100 * n_bytes)
 
 
 def read_text(path: Path, at_most: int = MAX_TEXT_BYTES, pipes: bool = False) -> str:
@@ -257,8 +256,8 @@ def read_text(path: Path, at_most: int = MAX_TEXT_BYTES, pipes: bool = False) ->
 
 def parse_json(text: str) -> Any:
     """Parse a JSON text. Raises ValueError if it is none, has too many values, or nests them too deeply."""
-    if sum(map(text.count, ",[{")) > MAX_JSON_VALUES:
-        raise ValueError(f"it has more than {MAX_JSON_VALUES:,} values")
+    if sum(map(text.count, ",[{")) > 1_500_000:  # an empty list takes three bytes of a file and eighty of memory
+        raise ValueError("it has more than 1,500,000 values")
     try:
         return json.loads(text)
     except RecursionError as error:
@@ -298,16 +297,13 @@ def read_yaml(path: Path) -> Any:
             return super().construct_mapping(node, deep)
 
     try:
-        return UniqueKeys(read_text(path, MAX_YAML_BYTES)).get_single_data()
+        return UniqueKeys(read_text(path, 100_000)).get_single_data()
     except (yaml.YAMLError, RecursionError, TypeError, OverflowError) as error:
         raise ValueError(" ".join(str(error).split())) from error
 
 
 MAX_PIXELS = 150_000_000
 """Limit for photographs; three bytes per pixel and a copy take 900 MB."""
-
-MAX_DEPTH_PIXELS = 25_000_000
-"""Limit for depth images; those of phones have half of it."""
 
 
 def image_size(image: Path | bytes, at_most: int = MAX_PIXELS) -> tuple[int, int]:

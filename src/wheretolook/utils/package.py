@@ -16,9 +16,7 @@ WEIGHTS = "data/release/weights"  # folder of the bundled weights
 
 def shipped(name: str | Path = "") -> Path:
     """Return the path of a bundled file or folder, or of the folder of all. Raises ConfigError if there is none."""
-    from importlib.resources import files
-
-    root = Path(str(files("wheretolook"))) / "shipped"
+    root = Path(__file__).parents[1] / "shipped"
     if not (root / name).exists():
         problem = "this file is not bundled with the package" if name else "the bundled files are missing"
         raise ConfigError(problem, path=root / name, fix="Correct the name, or install the package again.")

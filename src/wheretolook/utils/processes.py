@@ -28,13 +28,6 @@ from typing import Any, TypeVar
 from wheretolook.utils.errors import InUseError, LockWarning, WorkerError
 from wheretolook.utils.files import missing_folders, remove_if_empty
 
-READERS = 64  # that can share a lock on Windows
-_LOCKED = 2**20  # offset of the locked bytes, beyond the content of any lock file
-_PR_SET_PDEATHSIG = 1  # sys/prctl.h
-
-OPEN_LOCK = os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
-"""Flags for opening a lock file: not through a link, and without waiting for the other end of a pipe."""
-
 
 def cores() -> int:
     """Return the number of CPU cores that this process may use; all of them where the system has no such limit."""
@@ -55,13 +48,13 @@ def lock_file(file: int, shared: bool) -> None:
 
 
 def _lock_bytes(file: int, shared: bool) -> None:
-    """Lock on Windows, where each byte has one holder: a reader locks one of `READERS` bytes, a writer all."""
+    """Lock on Windows, where each byte has one holder: a reader locks one of 64 bytes, a writer all."""
     import msvcrt
 
-    for reader in range(READERS if shared else 1):
-        os.lseek(file, _LOCKED + reader, os.SEEK_SET)
+    for reader in range(64 if shared else 1):
+        os.lseek(file, 2**20 + reader, os.SEEK_SET)  # beyond the content of any lock file
         with suppress(PermissionError):
-            msvcrt.locking(file, msvcrt.LK_NBLCK, 1 if shared else READERS)  # type: ignore[attr-defined]
+            msvcrt.locking(file, msvcrt.LK_NBLCK, 1 if shared else 64)  # type: ignore[attr-defined]
             return
     raise BlockingIOError
 
@@ -83,13 +76,11 @@ def hold_back(number: int, held: bool) -> None:
 def end_with_starting_thread() -> None:
     """Let Linux kill this process when the thread that started it ends, whatever this process does (prctl(2))."""
     with suppress(OSError, AttributeError, TypeError):  # TypeError: Windows has no library without a name
-        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+        ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG of sys/prctl.h
 
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
-
-RETRY_S = 0.05  # until a signal that came during an import is sent again
 
 
 class WorkerPool:
@@ -224,7 +215,7 @@ def interrupt(number: int, frame: FrameType | None) -> None:
 
 
 def _send_later(number: int) -> None:
-    time.sleep(RETRY_S)
+    time.sleep(0.05)
     signal_main_thread(number)
 
 
@@ -271,10 +262,6 @@ def _exit_when_stopped(stopped: Connection) -> None:
     os._exit(1)
 
 
-_NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP, errno.EINVAL)
-_NOT_WRITABLE = (errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOENT, errno.ENOSPC)
-
-
 @contextmanager
 def hold(lock: Path, what: str, *, shared: bool = False, wait_s: float = 0.0) -> Iterator[None]:
     """Hold a lock on a file within this block; the file is created if missing and removed at the end,
@@ -294,16 +281,18 @@ def hold(lock: Path, what: str, *, shared: bool = False, wait_s: float = 0.0) ->
     """
     created = missing_folders(lock)
     deadline = time.monotonic() + wait_s
-    file = _try_lock(lock, shared)
-    while file == _HELD and time.monotonic() < deadline:
+    while True:
+        try:
+            file = _try_lock(lock, shared)
+            break
+        except BlockingIOError as error:
+            if time.monotonic() >= deadline:
+                holder = ""
+                with suppress(OSError):
+                    holder = lock.read_text(errors="replace")[:200]
+                fix = "Wait until it has ended, or end it, and run again."
+                raise InUseError("another process is using this", path=lock, value=holder, fix=fix) from error
         time.sleep(0.05)
-        file = _try_lock(lock, shared)
-    if file == _HELD:
-        holder = ""
-        with suppress(OSError):
-            holder = lock.read_text(errors="replace")[:200]
-        fix = "Wait until it has ended, or end it, and run again."
-        raise InUseError("another process is using this", path=lock, value=holder, fix=fix)
     if file is None:
         yield
         return
@@ -326,27 +315,23 @@ def hold(lock: Path, what: str, *, shared: bool = False, wait_s: float = 0.0) ->
                 remove_if_empty(created)
 
 
-_HELD = -1
-
-
 def _try_lock(lock: Path, shared: bool) -> int | None:
-    """Open and lock the file. Returns its descriptor, `_HELD` if others hold it, or None if locking is impossible."""
+    """Open and lock the file. Returns its descriptor, None if locking is impossible. Raises BlockingIOError if others hold it."""
+    # not through a link, and without waiting for the other end of a pipe
+    flags = os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
     try:
         if not shared:
             lock.parent.mkdir(parents=True, exist_ok=True)
-        file = os.open(lock, OPEN_LOCK, 0o666)
+        file = os.open(lock, flags, 0o666)
     except OSError as error:
-        if error.errno in _NOT_WRITABLE:
+        if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOENT, errno.ENOSPC):
             return None
         raise
     try:
         lock_file(file, shared)
-    except BlockingIOError:
-        os.close(file)
-        return _HELD
     except OSError as error:
         os.close(file)
-        if error.errno not in _NO_LOCKS:
+        if error.errno not in (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP, errno.EINVAL):
             raise
         text = f"{lock.parent}: this file system has no locks; make sure that only one process writes at a time"
         warnings.warn(text, LockWarning, stacklevel=4)

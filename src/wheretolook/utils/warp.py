@@ -18,8 +18,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from wheretolook.utils.errors import ConfigError
 
-KEPT_BYTES = 1 << 29  # of freed GPU memory a process keeps; each synchronization releases the rest, which takes time
-
 
 @cache  # looking for a driver takes 14 ms
 def start_warp(device: str = "cpu") -> str:
@@ -37,7 +35,8 @@ def start_warp(device: str = "cpu") -> str:
             raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(kernels))
         found = wp.get_device(device)
         if found.is_cuda and found.is_mempool_supported:
-            wp.set_mempool_release_threshold(found, KEPT_BYTES)
+            # bytes of freed memory that a process keeps: each synchronization releases the rest, which takes time
+            wp.set_mempool_release_threshold(found, 1 << 29)
         return str(found)
     except OSError as error:
         fix = "Set WARP_CACHE_PATH to a folder that can be written."

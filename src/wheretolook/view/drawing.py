@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from wheretolook.geometry.camera import Camera, PinholeCamera
-from wheretolook.geometry.mesh import TexturedMesh
+from wheretolook.geometry.mesh import TexturedMesh, cut_above
 from wheretolook.geometry.poses import Float, invert_poses
 
 Rgb = NDArray[np.uint8]
@@ -120,7 +120,6 @@ def mesh_glb(mesh: TexturedMesh, cut_m: float | None) -> bytes:
     """Return the mesh below a height as GLB, its textures scaled down to MAX_TEXTURE_PX."""
     from PIL import Image
 
-    from wheretolook.scenes.cutting import cut_above
     from wheretolook.scenes.loading import glb_bytes
 
     textures = [Image.fromarray(texture) for texture in mesh.textures]

@@ -126,7 +126,7 @@ def draw_overview(options: Demo, weights: Path) -> None:
 
     scene = open_scene(options, Dataset.load(options.root).scenes[-1])
     table = scene.folder.read_table()
-    scorer = load_scorer(weights, scene.folder.localization_map(scene.camera, scene.device))
+    scorer = load_scorer(scene.folder.localization_map(scene.camera, scene.device), weights)
     ids, first = np.unique(table["location_id"], return_index=True)
     locations = camera_centers(poses(table))[first]
     chosen = instructive_location(table)
@@ -194,7 +194,7 @@ def evaluate_look_sets(
         return None
     maps = [scene.localization_map(device=device) for scene in scenes]
     results = [
-        compare_looks(scene, load_scorer(str(weights), one, evaluate.anywhere), config, progress)
+        compare_looks(scene, load_scorer(one, str(weights), evaluate.anywhere), config, progress)
         for scene, one in zip(scenes, maps, strict=True)
     ]
     sets = pd.concat(results, ignore_index=True)

@@ -18,7 +18,7 @@ from tqdm.auto import tqdm
 from wheretolook.dataset.scene import Scene
 from wheretolook.dataset.viewpoint_table import LOCALIZED, is_good
 from wheretolook.evaluation.statistics import ClusterBootstrap, precision_area
-from wheretolook.features.config import ExtractorConfig
+from wheretolook.features.extractor import ExtractorConfig
 from wheretolook.geometry.poses import Float, camera_centers
 from wheretolook.localization.config import LocalizerConfig
 from wheretolook.localization.localizer import Localizer

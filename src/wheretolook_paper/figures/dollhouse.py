@@ -12,10 +12,9 @@ from matplotlib.collections import LineCollection
 from numpy.typing import ArrayLike, NDArray
 
 from wheretolook.geometry.camera import PinholeCamera
-from wheretolook.geometry.mesh import TexturedMesh
+from wheretolook.geometry.mesh import TexturedMesh, cut_above
 from wheretolook.geometry.poses import Float, poses_looking_along, rotation_looking_along, transform
 from wheretolook.rendering.warp_renderer import WarpRenderer
-from wheretolook.scenes.cutting import cut_above
 from wheretolook.utils.errors import SceneError
 
 AZIMUTH_DEG = -110.0  # direction of the eye, counter-clockwise from +x

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from wheretolook.figures.floor_plan import INK, RC, frame, new_figure
 from wheretolook.geometry.poses import Float
 from wheretolook.geometry.views import Views
-from wheretolook.planning.routes import lengths_along
+from wheretolook.planning.view_sequence import lengths_along
 from wheretolook.utils.texts import counted, score_text
 from wheretolook_paper.figures.animation import Pixels, pixels_of
 from wheretolook_paper.figures.style import Style

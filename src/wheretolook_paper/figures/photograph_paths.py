@@ -16,7 +16,7 @@ from wheretolook.dataset.layout import Dataset
 from wheretolook.figures.floor_plan import BLUE, GREY, RC, VERMILION, frame, new_figure
 from wheretolook.geometry.poses import Float, poses_looking_along
 from wheretolook.geometry.views import Views
-from wheretolook.planning.routes import lengths_along
+from wheretolook.planning.view_sequence import lengths_along
 from wheretolook.utils.errors import MissingRunError
 from wheretolook.utils.texts import markdown_table
 from wheretolook_paper.figures.path_film import PATH, draw_path

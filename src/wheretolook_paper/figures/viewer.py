@@ -10,9 +10,8 @@ from matplotlib.colors import to_rgb
 
 from wheretolook.figures.floor_plan import BLUE
 from wheretolook.geometry.camera import PinholeCamera
-from wheretolook.geometry.mesh import TexturedMesh
+from wheretolook.geometry.mesh import TexturedMesh, cut_above
 from wheretolook.geometry.poses import Float
-from wheretolook.scenes.cutting import cut_above
 from wheretolook.view.drawing import frustum_segments
 from wheretolook_paper.figures.style import ORANGE
 

@@ -6,7 +6,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from wheretolook.geometry.poses import Float, pan_tilt_angles
-from wheretolook.planning.routes import TurnLimit, ViewSequence, between, check_reached, check_scores, lengths_along
+from wheretolook.planning.view_sequence import (
+    TurnLimit,
+    ViewSequence,
+    between,
+    check_reached,
+    check_scores,
+    lengths_along,
+)
 
 SPACING_M = 0.2  # distance of waypoints in the Active Localization Benchmark
 CELL_DEG = 20.0

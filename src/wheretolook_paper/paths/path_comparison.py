@@ -17,8 +17,9 @@ from tqdm.auto import tqdm
 from wheretolook.dataset.viewpoint_table import pose_columns
 from wheretolook.geometry.poses import Float, poses_looking_along
 from wheretolook.planning.config import FORWARD
-from wheretolook.planning.routes import PlannedPath, TurnLimit, ViewSequence, best_sequence
+from wheretolook.planning.routes import PlannedPath
 from wheretolook.planning.rrt import plan_path
+from wheretolook.planning.view_sequence import TurnLimit, ViewSequence, best_sequence
 from wheretolook.planning.viewpoint_map import ViewpointMap
 from wheretolook.space.free_space import FreeSpace, MappedSpace
 from wheretolook.utils.errors import PlanningError, SceneError

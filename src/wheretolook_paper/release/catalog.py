@@ -171,7 +171,7 @@ _open = lru_cache(maxsize=1)(open_showcase)
 def _shown(source: Source, weights: str = "") -> tuple[Showcase, Any, int]:
     """Return the first test scene of a release, a scorer, and an instructive location."""
     showcase = _open(source.dataset)
-    scorer = load_scorer(source.dataset.root / "weights" / weights, showcase.localization_map)
+    scorer = load_scorer(showcase.localization_map, source.dataset.root / "weights" / weights)
     return showcase, scorer, showcase.instructive_location()
 
 

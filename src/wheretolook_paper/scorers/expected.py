@@ -62,7 +62,7 @@ class Expectation:
             for rows, described, n_in_view in describer.in_blocks(cam_from_world):
                 quantities[rows] = view_quantities(described, n_in_view, of_camera)
                 log_odds = self.log_odds(described.values)
-                parts = expected_parts(described.values, log_odds, described.attributes)[:, :16].double()
+                parts = expected_parts(described.values, log_odds, described.attributes).double()
                 sums[rows, :16] = torch.segment_reduce(parts, "sum", lengths=described.counts, initial=0.0).cpu()
                 sums[rows, 16] = self._filled_bins(described, log_odds).cpu()
             self._poses = cam_from_world.copy()

@@ -37,7 +37,7 @@ import pycolmap
 from jsonargparse import auto_cli
 from tqdm.auto import tqdm
 
-from wheretolook.commands.map import Map
+from wheretolook.commands.map import BuildMap
 from wheretolook.commands.options import MeshSource, ScenesConfig
 from wheretolook.commands.sample import Sample
 from wheretolook.commands.scenes import Scenes
@@ -48,9 +48,7 @@ from wheretolook.dataset.viewpoint_table import poses as poses_of_table
 from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.evaluation.scoring import score_scenes
 from wheretolook.evaluation.statistics import precision_area, precision_over_coverage
-from wheretolook.features.config import ExtractorConfig, KeypointExtractor
-from wheretolook.features.extractor import Keypoints
-from wheretolook.features.registry import all_kinds, kind_of
+from wheretolook.features.extractor import KINDS, ExtractorConfig, KeypointExtractor, Keypoints, kind_of
 from wheretolook.geometry.camera import Camera, camera_of, write_cameras
 from wheretolook.geometry.pose_files import images_text
 from wheretolook.geometry.poses import Float, camera_centers, pose_error
@@ -183,7 +181,7 @@ def render_set(source: str, locations: int, images: int, work: Path, workers: in
         return out
     dataset: dict[str, Any] = {"data": work, "name": f"scene-{Path(source).stem}", "device": device}
     Scenes(**dataset, scenes=scenes).run()
-    Map(**dataset, mapping=MapConfig(n_images=images, keep_images=True), label=LabelConfig(workers=workers)).run()
+    BuildMap(**dataset, mapping=MapConfig(n_images=images, keep_images=True), label=LabelConfig(workers=workers)).run()
     sample = SampleConfig(keep=0, max_locations=locations, max_directions=DIRECTIONS)
     (scene,) = Sample(**dataset, sample=sample).run().scenes
     table = scene.read_table()
@@ -347,7 +345,7 @@ def _triangulate(
 def _methods(fold: Fold, features: str, lightglue: str, retrieved: int, device: str) -> dict[str, dict[str, Pose]]:
     """Localize the queries of a fold by every method."""
     kind, stored = read_features(fold.features, [*fold.queries])
-    assert kind == all_kinds()[fold.landmarks.features]
+    assert kind == KINDS[fold.landmarks.features]
     queries = {
         name: Keypoints(pixels, kind.restore(descriptors))
         for name, (pixels, descriptors) in zip(fold.queries, stored, strict=True)

@@ -34,7 +34,7 @@ from wheretolook.geometry.poses import Float
 from wheretolook.localization.confidence import RIGHT_PLACE_LIMITS
 from wheretolook.scorers.adapted.calibration import finite_log_odds
 from wheretolook.scorers.set.accuracy import MARGIN, STATISTICS, AccuracyModel, LogError, probabilities, statistics_of
-from wheretolook.scorers.set.network import ALL_STATISTICS
+from wheretolook.scorers.set.network import VIEW_STATISTICS
 from wheretolook.scorers.set.score import SetScorer
 from wheretolook_paper.studies.fit_confidence import ACCURACIES, is_within
 
@@ -45,21 +45,21 @@ VIEWS = 6000  # of a scene, drawn at random
 
 
 def read_views(scene: SceneFolder, weights: Path) -> pd.DataFrame:
-    """Return errors (infinite without a pose), the network's probability `own` and `ALL_STATISTICS` of a scene's views."""
+    """Return errors (infinite without a pose), the network's probability `own` and `VIEW_STATISTICS` of a scene's views."""
     table = scene.read_table()
     table = table.sample(min(VIEWS, len(table)), random_state=0).reset_index(drop=True)
     numbers = table[CAMERA_ID] if CAMERA_ID in table else pd.Series(0, index=table.index)
     parts = []
     for number, camera in scene.cameras().items():
         part = table[numbers == number]
-        scorer = load_scorer(weights, scene.localization_map(camera))
+        scorer = load_scorer(scene.localization_map(camera), weights)
         assert isinstance(scorer, SetScorer)
         views = poses(part)
         for rows, described, n_visible in scorer.describer.in_blocks(views, scorer.max_landmarks):
-            sums = scorer._sums(views[rows], described, n_visible)
-            statistics = pd.DataFrame(statistics_of(scorer.network, *sums), columns=ALL_STATISTICS)
+            sums = scorer.network.sums_of(described, n_visible)
+            statistics = pd.DataFrame(statistics_of(scorer.network, sums), columns=VIEW_STATISTICS)
             found = part.iloc[rows][["error_m", "error_deg", "status"]].reset_index(drop=True)
-            own = probabilities(scorer.trained, scorer.accuracy, *sums)
+            own = probabilities(scorer.trained, scorer.accuracy, sums)
             parts.append(pd.concat([found, statistics], axis=1).assign(own=own, scene=scene.name))
     table = pd.concat(parts, ignore_index=True)
     table.loc[table["status"] != LOCALIZED, ["error_m", "error_deg"]] = np.inf
@@ -89,7 +89,7 @@ def fit(views: pd.DataFrame) -> AccuracyModel:
 
 def predict(model: AccuracyModel, views: pd.DataFrame, accuracy: Accuracy) -> Float:
     """Predict the probabilities (B,) that views are within an accuracy."""
-    return model.at(accuracy, ACCURACY, views["own"].to_numpy(), views[list(ALL_STATISTICS)].to_numpy())
+    return model.at(accuracy, ACCURACY, views["own"].to_numpy(), views[list(VIEW_STATISTICS)].to_numpy())
 
 
 def compare(title: str, parts: list[tuple[AccuracyModel, pd.DataFrame]]) -> None:

@@ -37,7 +37,7 @@ def drawn_sets(scene: SceneFolder, places: int, draws: int) -> pd.DataFrame:
     """Draw sets of views at random locations; return their expected and actual results."""
     table = read_table(scene.table, pixels=True)
     localization_map = scene.localization_map()
-    scorer = load_scorer(str(shipped(WEIGHTS) / "set.safetensors"), localization_map)
+    scorer = load_scorer(localization_map, str(shipped(WEIGHTS) / "set.safetensors"))
     rng = np.random.default_rng(0)
     cam_from_world = poses(table)
     scores = scorer.score(cam_from_world)

@@ -30,7 +30,7 @@ from sklearn.metrics import roc_auc_score
 from tqdm.auto import tqdm
 
 from wheretolook.evaluation.statistics import expected_calibration_error
-from wheretolook.features.config import ExtractorConfig
+from wheretolook.features.extractor import ExtractorConfig
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import Float, camera_centers, invert_poses, pose_error
 from wheretolook.holdout.photo_map import open_map

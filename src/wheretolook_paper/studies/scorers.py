@@ -9,7 +9,7 @@ Options are chosen by the mean validation average precision over seeds; the lear
 by the train stage with the best seed. Test scenes are scored once, with the weights of every seed.
 
 Appends a row per training to `<out>/<part>.csv` and skips existing rows. Weights are in `<out>/<method>-<seed>/weights`
-and `<out>/<part>/<condition>-<seed>.safetensors`. `--set '{"pooled": 8}'` changes the network that attributes, options
+and `<out>/<part>/<condition>-<seed>.safetensors`. `--set '{"width": 96}'` changes the network that attributes, options
 and curves start from; `--choices '[{"head": 96}, ...]'` are the options to try.
 """
 
@@ -46,7 +46,7 @@ OF_NETWORKS = MlpConfig(epochs=100, batch_size=4096, noise_px=1.0, noise_m=0.02,
 
 
 CHOICES: tuple[dict[str, Any], ...] = (
-    {}, {"pooled": 0}, {"pooled": 16}, {"width": 96}, {"width": 24}, {"head": 96}, {"dropout": 0.3}, {"l2": 1e-4},
+    {}, {"width": 96}, {"width": 24}, {"head": 96}, {"dropout": 0.3}, {"l2": 1e-4},
     {"learning_rate": 1e-3}, {"epochs": 16}, {"from_matchability": False}, {"landmarks": 96}, {"enlarged": 1.0},
 )  # fmt: skip
 """Options of the set network to try."""

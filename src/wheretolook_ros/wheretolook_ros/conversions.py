@@ -6,13 +6,16 @@ Poses are matrices (3, 4). ROS puts pixel (0, 0) at the centre of the top-left p
 from __future__ import annotations
 
 from collections.abc import Callable
+from io import BytesIO
 from typing import Any
 
 import cv2
 import numpy as np
+import PIL.Image
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Point, Pose, Quaternion, Vector3, Vector3Stamped
 from numpy.typing import NDArray
+from PIL import UnidentifiedImageError
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from std_msgs.msg import Header
@@ -33,6 +36,9 @@ UNDISTORT: dict[str, Any] = {
     "equidistant": cv2.fisheye.undistortPoints,
 }
 
+COEFFICIENTS = {"plumb_bob": (4, 5), "rational_polynomial": (8, 12, 14), "equidistant": (4,)}
+COMPRESSED = "JPEG", "PNG", "TIFF"  # formats of image_transport
+
 
 def seconds(stamp: Time) -> float:
     """Convert a stamp to seconds."""
@@ -46,9 +52,17 @@ def finite(values: Array) -> Array:
     return values
 
 
-def grey_image(message: Image | CompressedImage) -> NDArray[np.uint8]:
-    """Convert an image to grey (H, W) uint8. Raises ValueError for an encoding or a size that cannot be used."""
+def grey_image(message: Image | CompressedImage, size: tuple[int, int]) -> NDArray[np.uint8]:
+    """Convert an image of a size (width, height) to grey (H, W) uint8.
+
+    Raises ValueError for another size, which is read before the image is decoded, or for an encoding that is not known.
+    """
     if isinstance(message, CompressedImage):
+        try:
+            with PIL.Image.open(BytesIO(message.data), formats=COMPRESSED) as image:
+                check_size(image.size, size)
+        except UnidentifiedImageError as error:
+            raise ValueError(f"cannot decode the compressed image of format {message.format!r}") from error
         decoded = cv2.imdecode(np.frombuffer(message.data, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
         if decoded is None:
             raise ValueError(f"cannot decode the compressed image of format {message.format!r}")
@@ -56,8 +70,9 @@ def grey_image(message: Image | CompressedImage) -> NDArray[np.uint8]:
     encoding = message.encoding
     if encoding not in BYTES:
         raise ValueError(f"image encoding {encoding!r} is not supported, only {', '.join(BYTES)}")
-    size = BYTES[encoding]
-    width = message.width * size
+    check_size((message.width, message.height), size)
+    n_bytes = BYTES[encoding]
+    width = message.width * n_bytes
     data = np.frombuffer(message.data, np.uint8)
     if not 0 < width <= message.step or len(data) != message.step * message.height:
         size_px = f"{message.width} x {message.height} px {encoding}, step {message.step}"
@@ -65,11 +80,17 @@ def grey_image(message: Image | CompressedImage) -> NDArray[np.uint8]:
     rows = np.ascontiguousarray(data.reshape(message.height, message.step)[:, :width])
     if encoding in BAYERS:
         return _grey(cv2.cvtColor(rows, BAYERS[encoding]), "rgb")
-    if size > 2:
-        return _grey(rows.reshape(message.height, message.width, size), encoding)
-    if size == 1:
+    if n_bytes > 2:
+        return _grey(rows.reshape(message.height, message.width, n_bytes), encoding)
+    if n_bytes == 1:
         return rows
     return _bytes(rows.view(">u2" if message.is_bigendian else "<u2"))
+
+
+def check_size(found: tuple[int, int], expected: tuple[int, int]) -> None:
+    """Raise ValueError if an image has another size than its camera_info."""
+    if found != expected:
+        raise ValueError("the image has {} x {} px, but camera_info says {} x {}".format(*found, *expected))
 
 
 def _bytes(values: Array) -> NDArray[np.uint8]:
@@ -88,6 +109,9 @@ def pinhole_of(info: CameraInfo, rectified: bool) -> tuple[tuple[Any, ...], Call
     Both are in pixels of wheretolook. With `rectified`, images are those of image_proc. Raises ValueError for a camera
     that is not calibrated, or of another model.
     """
+    for name, numbers in (("k", info.k), ("p", info.p), ("d", info.d)):
+        if not np.isfinite(numbers).all():
+            raise ValueError(f"camera_info's {name} has a number that is not finite")
     matrix = np.reshape(info.p, (3, 4))[:, :3] if rectified else np.reshape(info.k, (3, 3))
     (fx, _, cx), (_, fy, cy), _ = matrix.tolist()
     if not min(fx, fy) > 0:
@@ -100,6 +124,10 @@ def pinhole_of(info: CameraInfo, rectified: bool) -> tuple[tuple[Any, ...], Call
         return pinhole, lambda pixels: pixels
     if info.distortion_model not in UNDISTORT:
         raise ValueError(f"distortion model {info.distortion_model!r} is not supported, only {', '.join(UNDISTORT)}")
+    if len(distortion) not in COEFFICIENTS[info.distortion_model]:
+        raise ValueError(
+            f"distortion model {info.distortion_model!r} has another number of coefficients than {len(distortion)}"
+        )
     undistort = UNDISTORT[info.distortion_model]
 
     def to_pinhole(pixels: Array) -> Array:

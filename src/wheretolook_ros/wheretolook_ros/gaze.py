@@ -5,7 +5,7 @@ Topics and parameters: docs/robots.md.
 
 from __future__ import annotations
 
-from typing import Any
+import pathlib
 
 import numpy as np
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, Vector3Stamped
@@ -14,6 +14,8 @@ from rclpy.duration import Duration
 from scipy.spatial.transform import Rotation
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
+from wheretolook.planning.view_sequence import TurnLimit, best_sequence, between, lengths_along
+from wheretolook.robot.wheretolook_robot import RobotScorer, fibonacci_sphere
 from wheretolook_ros.conversions import Array, direction_message, finite, pose_matrix, pose_message
 from wheretolook_ros.node import OK, RobotNode, run
 
@@ -27,7 +29,7 @@ class GazeNode(RobotNode):
         super().__init__("gaze")
         self._location = np.full(3, np.inf)  # of the base, where the best direction was searched last
         self._path = np.zeros((0, 3, 4))  # poses of the base
-        if not self.open_folder(self._open, "wheretolook_robot", "wheretolook_localization.planning.view_sequence"):
+        if not self.open_folder(self._open):
             return
         self._joints = self.create_publisher(JointTrajectory, "joint_trajectory", 10)
         self._gaze = self.create_publisher(Vector3Stamped, "gaze/direction", 10)
@@ -36,11 +38,10 @@ class GazeNode(RobotNode):
         self.listen(Vector3Stamped, "visual_localization/next_look", self._on_next_look)
         self.listen(Path, "plan", self._on_path)
 
-    def _open(self, robot: Any, view_sequence: Any) -> None:
-        self._scorer = robot.RobotScorer(self.settings.folder)
-        self._axes = robot.fibonacci_sphere(self.settings.directions)
-        self._limit = view_sequence.TurnLimit.of(self._axes, self.settings.max_turn_deg, pan_tilt=True)
-        self._sequences = view_sequence
+    def _open(self, folder: pathlib.Path) -> None:
+        self._scorer = RobotScorer(folder)
+        self._axes = fibonacci_sphere(self.settings.directions)
+        self._limit = TurnLimit.of(self._axes, self.settings.max_turn_deg, pan_tilt=True)
 
     def _on_next_look(self, message: Vector3Stamped) -> None:
         """Look where the localizer asks."""
@@ -87,7 +88,7 @@ class GazeNode(RobotNode):
             raise ValueError("no poses")
         points = np.array([pose_matrix(pose.pose)[:, 3] for pose in message.poses])
         path = self._waypoints(points, self.settings.spacing_m)
-        chosen = self._sequences.best_sequence(np.stack([self._scores(base) for base in path]), self._limit)
+        chosen = best_sequence(np.stack([self._scores(base) for base in path]), self._limit)
         self._path = path
         self._path_directions = self._axes[chosen.direction_ids]
         views = Path(header=message.header)
@@ -99,11 +100,9 @@ class GazeNode(RobotNode):
 
     def _waypoints(self, points: Array, spacing: float) -> Array:
         """Poses (W, 3, 4) of the base every `spacing` along a path (N, 3), with x along the path."""
-        lengths = self._sequences.lengths_along(points)
+        lengths = lengths_along(points)
         at = np.arange(0, lengths[-1] + 1e-6, spacing)
-        before, here, after = (
-            self._sequences.between(lengths, points, at + shift) for shift in (-spacing / 2, 0, spacing / 2)
-        )
+        before, here, after = (between(lengths, points, at + shift) for shift in (-spacing / 2, 0, spacing / 2))
         x, y, _ = (after - before).T
         turned = Rotation.from_euler("z", np.arctan2(y, x)[:, None]).as_matrix()
         return np.concatenate([turned, here[:, :, None]], axis=2)

@@ -6,6 +6,7 @@ Topics and parameters: docs/robots.md.
 from __future__ import annotations
 
 import time
+from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -16,6 +17,9 @@ from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, JointState
 from std_srvs.srv import Trigger
 
+from wheretolook.geometry.poses import compose_poses, invert_poses
+from wheretolook.robot.localizer import ImageSequence, RobotLocalizer
+from wheretolook.robot.wheretolook_robot import RobotScorer
 from wheretolook_ros.conversions import (
     Array,
     direction_message,
@@ -47,10 +51,8 @@ class LocalizerNode(RobotNode):
         self._odometry = Timeline()
         self._joints = Timeline()
         self._last_stamp = -np.inf
-        self._scorer: Any = None
-        if not self.open_folder(
-            self._open, "wheretolook_localization", "wheretolook_localization.geometry.poses", "wheretolook_robot"
-        ):
+        self._scorer: RobotScorer | None = None
+        if not self.open_folder(self._open):
             return
         self._poses = self.create_publisher(PoseWithCovarianceStamped, "visual_localization/pose", 10)
         self._looks = self.create_publisher(Vector3Stamped, "visual_localization/next_look", 10)
@@ -67,16 +69,14 @@ class LocalizerNode(RobotNode):
         self.create_timer(0.01, self._poll, clock=STEADY)
         self.create_timer(1.0, self._watch, clock=STEADY)
 
-    def _open(self, package: Any, poses: Any, robot: Any) -> None:
-        self._compose = poses.compose_poses
-        self._invert = poses.invert_poses
+    def _open(self, folder: Path) -> None:
         given = self.settings
-        localizer = package.RobotLocalizer(given.folder, given.turn_noise_deg, in_world=True)
+        localizer = RobotLocalizer(folder, given.turn_noise_deg, in_world=True)
         accuracy = given.accuracy_m, given.accuracy_deg
         limits = given.confidence, accuracy, given.max_views, given.max_move_m
-        self._sequence = package.ImageSequence(localizer, *limits)
+        self._sequence = ImageSequence(localizer, *limits)
         if given.next_look:
-            self._scorer = robot.RobotScorer(given.folder)
+            self._scorer = RobotScorer(folder)
 
     def _on_image(self, message: AnyImage) -> None:
         self._image = message
@@ -176,10 +176,7 @@ class LocalizerNode(RobotNode):
         """Match an image with the map; also returns what is unusual about its camera. Raises ValueError."""
         if self._info is None:
             raise ValueError("no camera_info received yet")
-        grey = grey_image(message)
-        if grey.shape != (self._info.height, self._info.width):
-            size = f"{self._info.width} x {self._info.height}"
-            raise ValueError(f"the image has {grey.shape[1]} x {grey.shape[0]} px, but camera_info says {size}")
+        grey = grey_image(message, (self._info.width, self._info.height))
         pinhole, to_pinhole = pinhole_of(self._info, self.settings.rectified)
         localizer = self._sequence.localizer
         camera = type(localizer.camera)(*grey.shape[::-1], *pinhole)
@@ -198,12 +195,12 @@ class LocalizerNode(RobotNode):
             return base_from_camera, None
         base = numbers.reshape(3, 4)
         base[:, :3] = Rotation.from_matrix(base[:, :3]).as_matrix()  # of an interpolated one the nearest rotation
-        return base_from_camera, self._invert(self._compose(base, base_from_camera))
+        return base_from_camera, invert_poses(compose_poses(base, base_from_camera))
 
     def _publish(self, pose: Any, base_from_camera: Array, image: AnyImage) -> None:
         """Publish the pose of the base in the map."""
-        map_from_camera = self._invert(pose.cam_from_world)
-        map_from_base = self._compose(map_from_camera, self._invert(base_from_camera))
+        map_from_camera = invert_poses(pose.cam_from_world)
+        map_from_base = compose_poses(map_from_camera, invert_poses(base_from_camera))
         lever = map_from_base[:, 3] - map_from_camera[:, 3]
         message = PoseWithCovarianceStamped()
         message.header.stamp = image.header.stamp

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
-from importlib import import_module
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -60,13 +59,12 @@ class RobotNode(Node):
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self.reported = (OK, "")
 
-    def open_folder(self, use: Callable[..., None], *modules: str) -> bool:
-        """Call a function with modules of the robot's folder; if that fails, report why from now on, return False."""
+    def open_folder(self, use: Callable[[Path], None]) -> bool:
+        """Call a function with the robot's folder; if that fails, report why from now on, return False."""
         folder = Path(self.settings.folder).absolute()
-        sys.path.insert(0, str(folder))
         try:
-            use(*map(import_module, modules))
-        except Exception as error:  # code of another version fails in any way
+            use(folder)
+        except Exception as error:  # whatever a folder of another version holds
             self.report(ERROR, f"cannot load {folder} as a folder of `wheretolook export --localize`: {error}")
             self.create_timer(1.0, lambda: self.report(*self.reported), clock=STEADY)
             return False

@@ -7,7 +7,7 @@ from itertools import product
 import numpy as np
 
 from wheretolook.geometry.lattices import direction_lattice
-from wheretolook.planning.routes import TurnLimit, best_sequence
+from wheretolook.planning.view_sequence import TurnLimit, best_sequence
 from wheretolook_paper.paths.greedy import greedy_sequence, resample_path
 
 

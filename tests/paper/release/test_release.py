@@ -120,7 +120,7 @@ def test_weights_in_half_precision_score_as_before(finished: Path, tmp_path: Pat
     convert_to_float16(halved)
     assert halved.stat().st_size < 0.55 * weights.stat().st_size
     scores = [
-        load_scorer(path, scene.localization_map()).score(poses(scene.read_table())) for path in (weights, halved)
+        load_scorer(scene.localization_map(), path).score(poses(scene.read_table())) for path in (weights, halved)
     ]
     np.testing.assert_allclose(*scores, atol=0.01)
 
@@ -237,7 +237,7 @@ def test_the_shipped_card_is_of_what_ships(shipped: Dataset) -> None:
         record = json.loads(path.with_suffix(".json").read_text())
         assert record["metrics"]["val_average_precision"] > least
     scene = shipped.split("test")[0]
-    assert load_scorer(shipped.root / "weights", scene.localization_map(shipped.camera)).name == "set"
+    assert load_scorer(scene.localization_map(shipped.camera), shipped.root / "weights").name == "set"
     assert sum(path.stat().st_size for path in (shipped.root / "weights").glob("*.safetensors")) < 10e6
 
 

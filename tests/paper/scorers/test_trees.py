@@ -64,7 +64,7 @@ def test_the_scorer_is_the_trees_on_pooled_views(tmp_path: Path) -> None:
     (model,) = train(dataset, train_config("trees", accelerator="cpu", trees=FEW), tracking, progress=False)
     scene = dataset.scenes[1]
     localization_map = scene.localization_map(dataset.camera)
-    scorer = load_scorer(model.path, localization_map)
+    scorer = load_scorer(localization_map, model.path)
     views = load_pooled(Dataset(dataset.root, (scene,)), [scene], (0.05, 0.4), "cpu", False)
     table = scene.read_table()
     np.testing.assert_array_equal(views.labels, is_good(table))
@@ -72,4 +72,4 @@ def test_the_scorer_is_the_trees_on_pooled_views(tmp_path: Path) -> None:
     np.testing.assert_allclose(scorer.score(poses(table)), expit(logits), rtol=1e-6)
     wide = localization_map.of_camera(replace(dataset.camera, focal_px=dataset.camera.focal_px / 2))
     assert scorer.in_range(poses(table)).mean() > 0.9
-    assert not load_scorer(model.path, wide).in_range(poses(table)).any()
+    assert not load_scorer(wide, model.path).in_range(poses(table)).any()

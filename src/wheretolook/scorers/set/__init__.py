@@ -54,7 +54,6 @@ class SetConfig(LandmarksConfig):
 
     Args:
         landmark_loss: weight of the loss of landmark detection, where matches are stored.
-        pooled: features that attention pools in addition to the expected information on the pose.
         head: units of the head's layers.
         dropout: share of the head's units dropped.
         from_matchability: start from `weights/matchability.safetensors` where the dataset has it.
@@ -65,7 +64,6 @@ class SetConfig(LandmarksConfig):
     learning_rate: float = 3e-3
     landmarks: int = no_option(192)
     landmark_loss: float = no_option(0.5)
-    pooled: int = no_option(0)
     head: int = no_option(48)
     dropout: float = no_option(0.1)
     from_matchability: bool = no_option(True)
@@ -73,7 +71,7 @@ class SetConfig(LandmarksConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_range(self, "head", at_least=1)
-        check_range(self, "landmark_loss", "pooled", at_least=0)
+        check_range(self, "landmark_loss", at_least=0)
         check_range(self, "dropout", at_least=0, below=1)
 
     @property

@@ -23,12 +23,11 @@ from typing import Any, Self
 import numpy as np
 import torch
 from scipy.special import log_ndtr
-from torch import Tensor
 
 from wheretolook.dataset.config import Accuracy
 from wheretolook.geometry.poses import Float
 from wheretolook.localization.confidence import LogisticRegression
-from wheretolook.scorers.set.network import ALL_STATISTICS, SetNetwork
+from wheretolook.scorers.set.network import VIEW_STATISTICS, SetNetwork, ViewSums
 from wheretolook.training.trained_network import TrainedNetwork
 from wheretolook.utils.errors import WeightsError
 from wheretolook.utils.files import read_json_object
@@ -46,8 +45,8 @@ class LogError:
 STATISTICS = ("log_visible", "log_orientation_variance", "log_expected_cells")
 """Features of the errors. None depends on the unit of length: errors scale with the deviation of the position."""
 
-FEATURES = [ALL_STATISTICS.index(name) for name in (*STATISTICS, "log_position_variance")]
-ORIENTATION = ALL_STATISTICS.index("log_orientation_variance")
+FEATURES = [VIEW_STATISTICS.index(name) for name in (*STATISTICS, "log_position_variance")]
+ORIENTATION = VIEW_STATISTICS.index("log_orientation_variance")
 MARGIN = 1e-5  # of probabilities from 0 and 1, so that their log-odds are finite
 
 
@@ -87,7 +86,7 @@ class AccuracyModel(LogisticRegression):
         return np.array([error.deviation for error in self.errors])
 
     def p_right_place(self, own: Any, statistics: Any, xp: Any = np) -> Any:
-        """Return P(right place) (B,) of views with the network's probabilities (B,) and `ALL_STATISTICS` (B, S)."""
+        """Return P(right place) (B,) of views with the network's probabilities (B,) and `VIEW_STATISTICS` (B, S)."""
         finite = xp.clip(own, MARGIN, 1 - MARGIN)
         of_odds, of_variance = self.weights
         log_odds = of_odds * xp.log(finite / (1 - finite)) + of_variance * statistics[:, ORIENTATION] + self.bias
@@ -117,7 +116,7 @@ class AccuracyModel(LogisticRegression):
         xp: Any = np,
         log_cdf: Any = log_ndtr,
     ) -> Any:
-        """Return probabilities (B,) at an accuracy from those (B,) at a network's own accuracy, and `ALL_STATISTICS`.
+        """Return probabilities (B,) at an accuracy from those (B,) at a network's own accuracy, and `VIEW_STATISTICS`.
 
         `log_cdf` is the log of the standard normal distribution function.
         """
@@ -129,25 +128,18 @@ class AccuracyModel(LogisticRegression):
         return probability * factor + (place - probability) * share
 
 
-def probabilities(
-    trained: TrainedNetwork[SetNetwork],
-    accuracy: Accuracy,
-    sums: Tensor,
-    n_visible: Tensor,
-    axis_height: Tensor,
-    cells: Tensor,
-) -> Float:
-    """Return the probabilities (B,) of views to localize within an accuracy; other arguments as of `SetNetwork.logits`."""
+def probabilities(trained: TrainedNetwork[SetNetwork], accuracy: Accuracy, views: ViewSums) -> Float:
+    """Return the probabilities (B,) of views to localize within an accuracy."""
     with torch.inference_mode():
-        logits = trained.network.logits(sums, n_visible, axis_height, cells).double()
+        logits = trained.network.logits(views).double()
         own = np.asarray(trained.calibrated(logits).sigmoid().cpu().numpy())
     if accuracy == trained.accuracy:
         return own
-    statistics = statistics_of(trained.network, sums, n_visible, axis_height, cells)
+    statistics = statistics_of(trained.network, views)
     return np.asarray(AccuracyModel.bundled().at(accuracy, trained.accuracy, own, statistics))
 
 
-def statistics_of(network: SetNetwork, *view: Tensor) -> Float:
-    """Return `ALL_STATISTICS` (B, S) of views; arguments as of `SetNetwork.logits`."""
+def statistics_of(network: SetNetwork, views: ViewSums) -> Float:
+    """Return `VIEW_STATISTICS` (B, S) of views."""
     with torch.inference_mode():
-        return np.asarray(network.statistics_of(*view).double().cpu().numpy())
+        return np.asarray(network.statistics_of(views).double().cpu().numpy())

@@ -128,7 +128,7 @@ def learn_set(task: TrainingJob, data: SetDataModule | None = None) -> TrainingR
     if options.starts_from and path.is_file():
         start = TrainedNetwork.load(path, MatchabilityNetwork, options.starts_from).network
         statistics = start.statistics if start.attributes == statistics.names else statistics
-    network = SetNetwork(statistics, options.width, options.pooled, options.head, options.dropout, options.hidden)
+    network = SetNetwork(statistics, options.width, options.head, options.dropout, options.hidden)
     if start is not None and (start.statistics, start.options) == (statistics, network.matchability.options):
         network.matchability.load_state_dict(start.state_dict())
     return train_network(network, data, replace(task, options=options))

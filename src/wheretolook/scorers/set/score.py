@@ -28,7 +28,7 @@ from wheretolook.mapping.landmarks import MAP_ATTRIBUTES
 from wheretolook.mapping.map import Map
 from wheretolook.scorers.base import LandmarkProbabilities, Scorer
 from wheretolook.scorers.set.accuracy import AccuracyModel, probabilities, statistics_of
-from wheretolook.scorers.set.network import N_EXPECTED, SetNetwork, bearing_precision, expected_cells
+from wheretolook.scorers.set.network import N_EXPECTED, SetNetwork, ViewSums, bearing_precision, expected_cells
 from wheretolook.training.trained_network import (
     RangeWatch,
     TrainedNetwork,
@@ -40,18 +40,6 @@ from wheretolook.utils.processes import cores
 from wheretolook.visibility.counting import FrustumLister, ListedViews, Surroundings, choose_size
 from wheretolook.visibility.frustum import LandmarkSets
 from wheretolook.visibility.occlusion import CachedOcclusion, DevicePoints, StoredOcclusion
-
-SERVED = {
-    "log_expected_inliers",
-    "log_visible",
-    "expected_share",
-    "log_position_variance",
-    "log_orientation_variance",
-    "log_det_information",
-    "axis_height",
-    "log_expected_cells",
-}
-"""Statistics of a view that do not depend on the camera's axes."""
 
 OF_LOCATION = ("distance", "mapped_angle", "distance_ratio", "pixel_size_ratio")
 """Attributes of a landmark that depend on the camera's location, but not on its orientation."""
@@ -119,11 +107,6 @@ class BatchedDirections:
         self._listers: dict[int, FrustumLister] = {}  # by the number of cells along a side
         self._lock = Lock()
 
-    @staticmethod
-    def serves(network: SetNetwork) -> bool:
-        """Return whether the inputs of a network's head are only what is `SERVED`."""
-        return network.attention is None and {*network.view_statistics} <= SERVED
-
     def score(self, locations: Float) -> Float:
         """Return scores (L, D) at locations (L, 3) m; a PoseError if one is not finite."""
         locations = check_locations(locations)
@@ -172,7 +155,7 @@ class BatchedDirections:
             n_visible = np.diff(listed.starts) / np.maximum(lengths, 1) * in_view[views]
             if self.device.type != "cpu":
                 wp.synchronize_device(self.points.device)  # Torch works on a stream of its own
-            scores[views] = self._of_listed(listed, nearby, stride, n_visible, self.directions[pairs[views, 1], 2])
+            scores[views] = self._of_listed(listed, nearby, stride, n_visible)
         return scores.reshape(-1, n_directions)
 
     def _lister(self, level: int) -> FrustumLister:
@@ -185,10 +168,8 @@ class BatchedDirections:
                 self._listers[size] = FrustumLister(camera, self.rotations, 0, self.points.device, **options)
             return self._listers[size]
 
-    def _of_listed(
-        self, listed: ListedViews, nearby: Surroundings, stride: int, n_visible: Float, heights: Float
-    ) -> Float:
-        """Return scores (V,) of listed views of `n_visible` (V,) landmarks in all, whose axes have z `heights` (V,)."""
+    def _of_listed(self, listed: ListedViews, nearby: Surroundings, stride: int, n_visible: Float) -> Float:
+        """Return scores (V,) of listed views of `n_visible` (V,) landmarks in all."""
         starts = listed.starts
         entries = wp.to_torch(listed.entries)
         image = wp.to_torch(listed.image)
@@ -211,11 +192,10 @@ class BatchedDirections:
             log_odds = torch.mv(hidden, self._last.weight[0]).add_(self._last.bias)
             ends = torch.from_numpy((part - part[0]).astype(np.int32)).to(self.device)
             p_detect = torch.sparse_csr_tensor(ends, here, log_odds.sigmoid(), size=(len(part) - 1, len(terms)))
-            sums[views, :16] = p_detect @ terms
+            sums[views] = p_detect @ terms
             of_view = torch.arange(len(part) - 1, device=self.device).repeat_interleave(ends.diff())
             cells[views] = expected_cells(image[span], log_odds, of_view, each[views], OF_IMAGE)
-        height = torch.from_numpy(heights).to(sums)
-        return probabilities(self.trained, self.accuracy, sums * each[:, None], visible, height, cells)
+        return probabilities(self.trained, self.accuracy, ViewSums(sums * each[:, None], visible, cells))
 
     def _described(self, offsets: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
         """Return the first layer (M, W) of landmarks without their position in the image, and their terms of sums (M, 16).
@@ -448,9 +428,8 @@ class SetScorer(LandmarkScorer):
         quantities: list[Float] = []
         for rows, described, n_visible in self.describer.in_blocks(cam_from_world, MAX_LANDMARKS):
             quantities += self._quantities(described, n_visible)
-            scores[rows] = probabilities(
-                self.trained, self.accuracy, *self._sums(cam_from_world[rows], described, n_visible)
-            )
+            views = self.network.sums_of(described, n_visible)
+            scores[rows] = probabilities(self.trained, self.accuracy, views)
         self._watch.check(self.name, self.training_range, quantities)
         return scores
 
@@ -464,10 +443,10 @@ class SetScorer(LandmarkScorer):
         n_visible = np.zeros(n, dtype=np.int64)
         in_range = np.full(n, self._serves_camera)
         for rows, described, visible in self.describer.in_blocks(cam_from_world, MAX_LANDMARKS):
-            sums = self._sums(cam_from_world[rows], described, visible)
-            score[rows] = probabilities(self.trained, self.accuracy, *sums)
-            expected_inliers[rows] = sums[0][:, 0].cpu().numpy()
-            errors[rows] = AccuracyModel.bundled().expected_errors(statistics_of(self.network, *sums))
+            views = self.network.sums_of(described, visible)
+            score[rows] = probabilities(self.trained, self.accuracy, views)
+            expected_inliers[rows] = views.sums[:, 0].cpu().numpy()
+            errors[rows] = AccuracyModel.bundled().expected_errors(statistics_of(self.network, views))
             n_visible[rows] = visible.cpu().numpy()
             in_range[rows] &= self._in_range(described, visible)
         return Views(
@@ -493,17 +472,8 @@ class SetScorer(LandmarkScorer):
         log_odds: Tensor = self.network.matchability(values)
         return log_odds
 
-    def _sums(self, cam_from_world: Float, described: ViewLandmarks, n_visible: Tensor) -> tuple[Tensor, ...]:
-        """Return the arguments of `SetNetwork.logits` for described views."""
-        height = torch.from_numpy(cam_from_world[:, 2, 2]).to(described.values)
-        with torch.inference_mode():
-            sums, cells = self.network.sums_of(described, n_visible)
-        return sums, n_visible, height, cells
-
     def score_directions(self, locations: Float, directions: Float) -> Float:
         """Return probabilities (L, D); where many landmarks are visible, from a smaller sample than `score`."""
-        if not BatchedDirections.serves(self.network):
-            return super().score_directions(locations, directions)
         if self._batched is None or not np.array_equal(self._batched.directions, directions):
             self._batched = BatchedDirections(
                 self.localization_map, self.trained, directions, MAX_LANDMARKS // 2, self.accuracy

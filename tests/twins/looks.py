@@ -8,7 +8,7 @@ from wheretolook.looks.selection import ViewSet, score_of_set
 
 
 def joint_sums(views, rows):
-    """`CandidateViews.joint_sums`, landmark by landmark."""
+    """`Detections.joint_sums`, landmark by landmark."""
     sums = np.zeros(16)
     for landmark, terms in enumerate(views.terms):
         missed = 1.0

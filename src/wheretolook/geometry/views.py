@@ -90,7 +90,7 @@ class Views:
     location_id: Column = None
     viewpoint_id: Column = None
     block: Column = None
-    good: Column = None  # (V, T) whether the view localizes within each of T thresholds
+    good: Column = None  # (V,) whether the view localizes, or (V, T) within each of T thresholds
     direction_id: Column = None  # (V,) row of the direction in a lattice, -1 where there is no view
     pixels: Column = None  # V arrays (K, 2) of the landmarks in view
     images: Column = None  # (V, H, W, 3) uint8

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, eq=False)
-class CandidateViews:
+class Detections:
     """What each of D views from one location detects of U landmarks."""
 
     p_detect: NDArray[np.float32]  # (D, U) probability that the view detects the landmark; 0 where it is not visible
@@ -65,7 +65,7 @@ class CandidateViews:
 
 def candidate_views(
     scorer: Scorer, location: Float, directions: Float, scores: Float | None = None, certain: bool = False
-) -> CandidateViews:
+) -> Detections:
     """Describe what views along directions (D, 3) from a location (3,) m detect.
 
     `scores` (D,) of the scorer are the views' probabilities of localizing, if its method predicts those. Where the
@@ -105,7 +105,7 @@ def candidate_views(
             raise ConfigError("joint scores have the accuracy of the weights", value=scorer.name, fix=fix)
         if scores is not None and method is not None and method.probability:
             p_single = np.clip(np.asarray(scores, dtype=np.float64), 0, 1)
-    return CandidateViews(p_detect, terms * stride, n_visible, p_single)
+    return Detections(p_detect, terms * stride, n_visible, p_single)
 
 
 def log_position_variance(sums: Float) -> Float:
@@ -251,7 +251,7 @@ def _cosine(limit_deg: float) -> float:
 
 
 def select_views(
-    views: CandidateViews,
+    views: Detections,
     set_score: SetScore,
     n: int,
     rotations: Rotations,
@@ -313,11 +313,11 @@ def select_views(
     return ViewSet(order, score, total)
 
 
-def score_of_set(views: CandidateViews, set_score: SetScore, rows: list[int]) -> float:
+def score_of_set(views: Detections, set_score: SetScore, rows: list[int]) -> float:
     """Return the score of a set of views."""
     return float(set_score(views.joint_sums(rows)[None], np.array([views.p_none(rows)]))[0])
 
 
-def _with_each(views: CandidateViews, set_score: SetScore, rows: list[int]) -> Float:
+def _with_each(views: Detections, set_score: SetScore, rows: list[int]) -> Float:
     """Return the score (D,) of a set with each view added."""
     return set_score(views.sums_with_each(rows), views.p_none(rows) * (1 - views.p_single))

@@ -9,10 +9,10 @@ from typing import Self
 from urllib.parse import parse_qs, urlsplit
 
 import numpy as np
-from numpy.typing import NDArray
 
-from wheretolook.geometry.poses import Float, camera_centers, poses_looking_along
+from wheretolook.geometry.poses import Float, poses_looking_along
 from wheretolook.geometry.similarity import Similarity
+from wheretolook.geometry.views import Views
 from wheretolook.mapping.map_frame import IDENTITY
 from wheretolook.utils.errors import ConfigError, TableError
 
@@ -110,19 +110,8 @@ def _parse_value(name: str, text: str) -> object:
     raise ValueError(text)
 
 
-@dataclass(frozen=True, eq=False)
-class RecordedPath:
-    """Views along a path."""
-
-    cam_from_world: Float  # (W, 3, 4)
-    localized: NDArray[np.bool_] | None = None  # (W,) whether each view localized; None if unknown
-
-    def __len__(self) -> int:
-        return len(self.cam_from_world)
-
-
-Paths = dict[str, RecordedPath]
-"""Paths by method."""
+Paths = dict[str, Views]
+"""Views along paths by method; `good` is whether each localized, None if unknown."""
 
 
 def read_paths(path: Path, pair: int = 0, world_from_map: Similarity = IDENTITY.world_from_map) -> Paths:
@@ -131,7 +120,6 @@ def read_paths(path: Path, pair: int = 0, world_from_map: Similarity = IDENTITY.
     Poses are moved from the map's own frame to the world. A single path is accompanied by `FORWARD`: the same locations
     seen by a camera that looks ahead. Raises TableError if the file is missing or has no valid poses.
     """
-    from wheretolook.geometry.views import Views
     from wheretolook.planning.config import FORWARD
 
     if path.is_dir():
@@ -139,7 +127,7 @@ def read_paths(path: Path, pair: int = 0, world_from_map: Similarity = IDENTITY.
     if path.suffix == ".parquet":
         paths = _compared_paths(path, pair)
     else:
-        paths = {"planned" if path.name == "path.csv" else path.stem: RecordedPath(Views.read(path).cam_from_world)}
+        paths = {"planned" if path.name == "path.csv" else path.stem: Views.read(path)}
     if not 1 <= len(paths) <= MAX_METHODS:
         problem = f"1 to {MAX_METHODS} methods can be shown"
         raise TableError(problem, path=path, value=len(paths), fix="Correct --pair, or leave out methods.")
@@ -151,7 +139,7 @@ def read_paths(path: Path, pair: int = 0, world_from_map: Similarity = IDENTITY.
     paths = {name: replace(along, cam_from_world=place(along.cam_from_world)) for name, along in paths.items()}
     if len(paths) == 1:
         (only,) = paths.values()
-        return {FORWARD: RecordedPath(looking_ahead(camera_centers(only.cam_from_world))), **paths}
+        return {FORWARD: Views(looking_ahead(only.positions)), **paths}
     return paths
 
 
@@ -186,7 +174,8 @@ def _compared_paths(path: Path, pair: int) -> Paths:
         for name in methods:
             rows = chosen[chosen["method"] == name]
             has_labels = "status" in rows and not (rows["status"] == UNLABELLED).any()
-            paths[str(name)] = RecordedPath(poses(rows), is_good(rows, GOOD_M, GOOD_DEG) if has_labels else None)
+            good = is_good(rows, GOOD_M, GOOD_DEG) if has_labels else None
+            paths[str(name)] = Views(poses(rows), method=str(name), good=good)
         return paths
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise TableError(f"no path can be read: {error}", path=path, fix=_PATH_FIX) from error

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from wheretolook.geometry.poses import Float
-from wheretolook.looks.selection import CandidateViews, Rotations, SetScoreModel, select_views
+from wheretolook.looks.selection import Detections, Rotations, SetScoreModel, select_views
 from wheretolook_paper.fisher.metrics import metric_of
 
 
@@ -41,13 +41,7 @@ def evenly_spread(directions: Float, n: int, first: int) -> list[int]:
 
 
 def choose_set(
-    strategy: str,
-    n: int,
-    axes: Float,
-    scores: Float,
-    views: CandidateViews,
-    certain: CandidateViews,
-    rng: np.random.Generator,
+    strategy: str, n: int, axes: Float, scores: Float, views: Detections, certain: Detections, rng: np.random.Generator
 ) -> list[int]:
     """Return the rows of n views along axes (D, 3) with scores (D,) that a strategy of the tables chooses."""
     if strategy == "random":

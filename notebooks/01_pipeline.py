@@ -26,11 +26,10 @@
 from IPython.display import Markdown, display
 
 from wheretolook import load_scorer
-from wheretolook_paper.figures.peaks import peaks_figure
+from wheretolook_paper.figures.network import peaks_figure
 from wheretolook_paper.figures.pipeline import pipeline_figure
 from wheretolook_paper.release.notebook import open_release
-from wheretolook_paper.release.showcase import open_showcase
-from wheretolook_paper.release.showcase_figures import peaks_of, pipeline_of
+from wheretolook_paper.release.showcase import open_showcase, peaks_of, pipeline_of
 
 # %% [markdown]
 # The release contains landmarks, viewpoints and labels, but no meshes: the apartment is generated again from its seed,

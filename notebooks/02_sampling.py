@@ -24,11 +24,9 @@
 # %config InlineBackend.figure_formats = ["retina"]
 from IPython.display import display
 
-from wheretolook_paper.figures.lattices import fibonacci_figure
-from wheretolook_paper.figures.sampling import sampling_figure
+from wheretolook_paper.figures.sampling import fibonacci_figure, sampling_figure
 from wheretolook_paper.release.notebook import open_release
-from wheretolook_paper.release.showcase import open_showcase
-from wheretolook_paper.release.showcase_figures import sampling_of
+from wheretolook_paper.release.showcase import open_showcase, sampling_of
 
 # %% [markdown]
 # An apartment of the release, generated again from its seed, and a location where half of all views fail.

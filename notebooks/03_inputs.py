@@ -26,12 +26,10 @@
 from IPython.display import display
 
 from wheretolook import load_scorer
-from wheretolook_paper.figures.inputs import inputs_figure
-from wheretolook_paper.figures.network_walkthrough import learning_figure
+from wheretolook_paper.figures.network import inputs_figure, learning_figure
 from wheretolook_paper.release.mlp_architecture import architecture_table
 from wheretolook_paper.release.notebook import open_release
-from wheretolook_paper.release.showcase import open_showcase
-from wheretolook_paper.release.showcase_figures import learning_of
+from wheretolook_paper.release.showcase import learning_of, open_showcase
 
 # %% [markdown]
 # An apartment of the release, generated again from its seed, and the bundled version of the paper's network.

@@ -37,7 +37,7 @@ tracking = open_store(release)
 
 # %%
 from wheretolook.tracking import newest_run
-from wheretolook_paper.release.paper_architecture import paper_architecture_table
+from wheretolook_paper.release.mlp_architecture import paper_architecture_table
 
 run = newest_run(tracking, "train", params={"dataset": release.name, "method": "mlp-2d+3d"})
 paper_architecture_table(run.data.params).style.hide()
@@ -61,7 +61,7 @@ trained(tracking, release.name).style.hide().format(precision=3, na_rep="–")
 # checkpoint. Diverging lines indicate overfitting.
 
 # %%
-from wheretolook_paper.figures.training import training_figure
+from wheretolook_paper.figures.scores import training_figure
 from wheretolook_paper.release.training_histories import histories
 
 curves = histories(tracking, release.name)
@@ -79,7 +79,7 @@ display(training_figure(curves) if curves else Markdown(f"No run has a history y
 # %%
 from wheretolook.evaluation.statistics import read_calibration
 from wheretolook.tracking import newest_artifact
-from wheretolook_paper.figures.calibration import calibration_figure
+from wheretolook_paper.figures.scores import calibration_figure
 
 calibration = read_calibration(newest_artifact(tracking, "evaluate", "calibration.csv", release.name))
 display(calibration_figure(calibration))
@@ -104,9 +104,8 @@ pd.DataFrame(columns).style.format(precision=3)
 
 # %%
 from wheretolook import load_scorer
-from wheretolook_paper.figures.peaks import peaks_figure
-from wheretolook_paper.release.showcase import open_showcase
-from wheretolook_paper.release.showcase_figures import mistaken_location, peaks_of
+from wheretolook_paper.figures.network import peaks_figure
+from wheretolook_paper.release.showcase import mistaken_location, open_showcase, peaks_of
 
 # %% [markdown]
 # A location in an apartment not used for training, where half of all views fail. Its mesh is generated again from its

@@ -25,9 +25,8 @@
 # %config InlineBackend.figure_formats = ["retina"]
 from IPython.display import Markdown, display
 
-from wheretolook_paper.evaluation.paper_tables import NOTE
+from wheretolook_paper.evaluation.paper_tables import NOTE, latest_paper_table, paper_styler
 from wheretolook_paper.release.notebook import open_release, open_store
-from wheretolook_paper.release.table_view import latest_paper_table, paper_styler
 
 release = open_release()
 tracking = open_store(release)
@@ -90,7 +89,7 @@ display(regret_figure(latest_scores(tracking, "interiors")))
 # network. Counting methods and summed information lose most.
 
 # %%
-from wheretolook_paper.figures.occlusion import occlusion_figure
+from wheretolook_paper.figures.scores import occlusion_figure
 
 display(occlusion_figure(scores))
 

@@ -26,7 +26,7 @@
 from IPython.display import Markdown, display
 
 from wheretolook.evaluation.results import latest_scores
-from wheretolook_paper.figures.top_n import top_n_figure
+from wheretolook_paper.figures.scores import top_n_figure
 from wheretolook_paper.release.notebook import open_release, open_store
 
 release = open_release()
@@ -58,7 +58,7 @@ display(top_n_figure(scores, expected))
 # Within 5 cm and 0.4°, in %: positive views among the best N, and locations with a positive view among N.
 
 # %%
-from wheretolook_paper.figures.top_n import top_n_table
+from wheretolook_paper.figures.scores import top_n_table
 
 table = top_n_table(scores)
 display(table.style.format(precision=1))

@@ -29,12 +29,13 @@ from IPython.display import Markdown, display
 from wheretolook.planning.config import PathConfig, PlanConfig
 from wheretolook.planning.scene_map import path_views, plan_by_methods
 from wheretolook.tracking import newest_artifact
-from wheretolook_paper.figures.path_film import methods_figure, still_figure
-from wheretolook_paper.figures.paths import paths_figure
-from wheretolook_paper.figures.photograph_paths import (
+from wheretolook_paper.figures.paths import (
+    methods_figure,
+    paths_figure,
     photograph_paths_figure,
     photograph_paths_markdown,
     read_photograph_paths,
+    still_figure,
 )
 from wheretolook_paper.paths.config import PathsConfig
 from wheretolook_paper.paths.path_report import path_markdown

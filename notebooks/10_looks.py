@@ -45,8 +45,7 @@ from wheretolook.scenes.config import ApartmentConfig
 from wheretolook.scenes.loading import load_mesh, save_glb
 from wheretolook.space.free_space import FreeSpace
 from wheretolook_paper.figures.dollhouse import dollhouse
-from wheretolook_paper.figures.look_story import localize_views, story_figure
-from wheretolook_paper.figures.looks import looks_figure
+from wheretolook_paper.figures.looks import localize_views, looks_figure, story_figure
 from wheretolook_paper.release.notebook import open_release
 from wheretolook_rooms.generator import generate_apartment
 

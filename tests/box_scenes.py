@@ -1,6 +1,7 @@
 """Textured scenes made of boxes and quads, whose geometry and colours are known in closed form."""
 
 import numpy as np
+from scipy.ndimage import gaussian_filter
 
 from wheretolook.geometry.mesh import TexturedMesh
 
@@ -24,15 +25,15 @@ def random_texture(rng, height, width):
 
 
 def quads_mesh(quads, textures, repeat=1.0, vertex_colors=None):
-    """A mesh of quads (Q, 4, 3), each with the whole of texture q % len(textures), `repeat` times over."""
+    """A mesh of quads (Q, 4, 3), each with texture q % len(textures), `repeat` times over: a number, or (Q, 2)."""
     quads = np.asarray(quads, dtype=np.float32)
     first = 4 * np.arange(len(quads))[:, None, None]
     triangles = (first + np.array([[0, 1, 2], [0, 2, 3]])).reshape(-1, 3)
-    uvs = np.tile(_QUAD_UVS * repeat, (len(quads), 1)).astype(np.float32)
+    uvs = _QUAD_UVS * np.broadcast_to(repeat, (len(quads), 2))[:, None]
     return TexturedMesh(
         quads.reshape(-1, 3),
         triangles.astype(np.int32),
-        uvs[triangles],
+        uvs.reshape(-1, 2).astype(np.float32)[triangles],
         np.repeat(np.arange(len(quads)) % len(textures), 2).astype(np.int32),
         tuple(textures),
         vertex_colors,
@@ -77,3 +78,26 @@ def random_triangles(seed, n_triangles=300):
         tuple(textures),
         rng.integers(0, 256, (3 * n_triangles, 3), dtype=np.uint8) if seed % 2 else None,
     )
+
+
+ROOM_SIZE = (5.0, 4.0, 2.6)
+LOW_X, HIGH_X = 4, 5  # faces of a box that `box_quads` returns
+
+
+def noise_texture(rng, size=512):
+    """Coloured blobs of several sizes, periodic."""
+    image = np.zeros((size, size, 3))
+    for sigma in (2, 4, 8, 16):
+        layer = gaussian_filter(rng.normal(size=(size, size, 3)), (sigma, sigma, 0), mode="wrap")
+        image += layer / layer.std()
+    return np.clip(128 + 35 * image, 0, 255).astype(np.uint8)
+
+
+def box_room(size=ROOM_SIZE, texture_m=2.5, more_quads=(), more_textures=()):
+    """The inside of a box with a corner at the origin, with a repeated texture on each face, and more quads in it."""
+    rng = np.random.default_rng(0)
+    faces = box_quads((0, 0, 0), size, inward=True)
+    repeat = np.linalg.norm(faces[:, [1, 3]] - faces[:, :1], axis=2) / texture_m
+    quads = np.concatenate([faces, np.reshape(more_quads, (-1, 4, 3))])
+    textures = [*(noise_texture(rng) for _ in faces), *more_textures]
+    return quads_mesh(quads, textures, np.concatenate([repeat, np.ones((len(more_textures), 2))]))

@@ -100,6 +100,11 @@ class RandomViews:
     cam_from_world: Float
 
 
+@pytest.fixture
+def rng():
+    return np.random.default_rng(0)
+
+
 @pytest.fixture(params=[0, 1, 2])
 def random_views(request):
     rng = np.random.default_rng(request.param)

@@ -6,8 +6,7 @@ from box_scenes import box_quads, quads_mesh, random_texture
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.geometry.tsdf import DepthImage
-from wheretolook.rendering.raycasting import MeshRaycaster
-from wheretolook.rendering.warp_renderer import camera_rays
+from wheretolook.rendering.warp_renderer import WarpRenderer
 
 ROOM = np.array([4.0, 3.0, 2.5])
 CUPBOARD = np.array([[0.0, 2.2, 0.0], [1.2, 3.0, 1.6]])
@@ -35,13 +34,5 @@ def depth_images(mesh, seed, n, camera=CAMERA):
     """Exact depth images from random free places in random, mostly level directions."""
     rng = np.random.default_rng(seed)
     poses = poses_looking_along(free_points(rng, n), rng.normal(size=(n, 3)) * (1, 1, 0.5))
-    raycaster = MeshRaycaster(mesh)
-    x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
-    pixels = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3)
-    images = []
-    for pose, center, ray_from_pixel in zip(poses, *camera_rays(camera, poses), strict=True):
-        rays = pixels @ ray_from_pixel.T
-        distance = raycaster.cast(np.broadcast_to(center, rays.shape), rays).distance_m
-        z = (distance / np.linalg.norm(rays, axis=1)).reshape(x.shape)
-        images.append(DepthImage(z.astype(np.float32), camera, pose))
-    return images
+    depth_m = WarpRenderer(mesh, method="rays").render(camera, poses).depth_m
+    return [DepthImage(image, camera, pose) for image, pose in zip(depth_m, poses, strict=True)]

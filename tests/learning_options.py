@@ -7,22 +7,20 @@ from wheretolook.scorers.mlp import MlpConfig
 from wheretolook.scorers.train_config import TrainConfig
 from wheretolook.training.trained_network import TrainedNetwork
 
-OF_MLP = {option.name for option in fields(MlpConfig)}
-
 
 def train_config(*methods, **options):
-    """Options of training some methods; those that not all learners share are of the paper's network."""
-    own = {name: value for name, value in options.items() if name in OF_MLP}
-    rest = {name: value for name, value in options.items() if name not in OF_MLP}
+    """Options of training some methods; see `changed`."""
     named = {"methods": methods} if methods else {}
-    return TrainConfig(**named, mlp=MlpConfig(**own), **rest)
+    return changed(TrainConfig(), **named, **options)
 
 
 def changed(config, **options):
-    """Other options; those that not all learners share are of the paper's network."""
-    own = {name: value for name, value in options.items() if name in OF_MLP}
-    rest = {name: value for name, value in options.items() if name not in OF_MLP}
-    return replace(config, mlp=replace(config.mlp, **own), **rest)
+    """Other options: of a learner as a dictionary, if it is installed; those that no other has are of the MLP's."""
+    of_mlp = {option.name for option in fields(MlpConfig)}
+    groups = {"mlp": {name: options.pop(name) for name in [*options] if name in of_mlp}}
+    groups |= {name: options.pop(name) for name in [*options] if isinstance(options[name], dict)}
+    changes = {name: replace(getattr(config, name), **own) for name, own in groups.items() if hasattr(config, name)}
+    return replace(config, **options, **changes)
 
 
 def save_network(

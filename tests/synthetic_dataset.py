@@ -19,23 +19,29 @@ CAMERA = PinholeCamera(160, 120, 80.0)
 BINS = 30
 
 
-def make_landmarks(rng, n):
-    """Landmarks on one half of a box's walls, so that some directions see many and others none."""
+def make_landmarks(rng, n, **given):
+    """Landmarks on one half of a box's walls, so that some directions see many and others none.
+
+    Given attributes, a number for all or (n, …), replace random ones.
+    """
     points = rng.uniform((-3, -3, 0), (3, 3, 2.5), (n, 3))
     wall = rng.integers(0, 2, n)
     points[np.arange(n), wall] = rng.choice([3.0, 2.9], n)
     values = {
         "track_length": rng.integers(2, 9, n).astype(np.int32),
-        "reprojection_error_px": rng.random(n).astype(np.float32) / 2,
-        "triangulation_angle_deg": rng.uniform(2, 40, n).astype(np.float32),
-        "mapping_direction": (points / np.linalg.norm(points, axis=1, keepdims=True)).astype(np.float32),
-        "mapping_direction_spread": rng.random(n).astype(np.float32),
-        "mapping_distance_m": rng.uniform(1, 4, n).astype(np.float32),
-        "ambiguity": rng.random(n).astype(np.float32),
-        "mapping_distance_spread": np.linspace(0, 0.5, n, dtype=np.float32),
-        "mapping_focal_px": np.linspace(60, 120, n, dtype=np.float32),
+        "reprojection_error_px": rng.random(n) / 2,
+        "triangulation_angle_deg": rng.uniform(2, 40, n),
+        "mapping_direction": points / np.linalg.norm(points, axis=1, keepdims=True),
+        "mapping_direction_spread": rng.random(n),
+        "mapping_distance_m": rng.uniform(1, 4, n),
+        "ambiguity": rng.random(n),
+        "mapping_distance_spread": np.linspace(0, 0.5, n),
+        "mapping_focal_px": np.linspace(60, 120, n),
     }
-    return Landmarks(ids=np.arange(n, dtype=np.int64), points=points, descriptors=None, **values)
+    values |= {name: np.broadcast_to(given[name], value.shape) for name, value in values.items() if name in given}
+    columns = {name: value.astype(np.int32 if name == "track_length" else np.float32) for name, value in values.items()}
+    points = given.get("points", points)
+    return Landmarks(ids=np.arange(n), points=points, descriptors=given.get("descriptors"), **columns)
 
 
 def make_mapping_poses(seed, n=12):

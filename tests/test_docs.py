@@ -27,7 +27,7 @@ from wheretolook.mapping.colmap_model import colmap_poses
 from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.scenes.loading import save_glb
 from wheretolook.utils import errors
-from wheretolook_paper.figures.photograph_paths import photograph_paths_markdown, read_photograph_paths
+from wheretolook_paper.figures.paths import photograph_paths_markdown, read_photograph_paths
 from wheretolook_paper.release.numbers import Numbers, pages, updated
 
 ROOT = Path(__file__).parents[1]

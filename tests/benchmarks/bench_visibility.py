@@ -251,7 +251,7 @@ def draw(args: argparse.Namespace) -> None:
     from wheretolook.figures.floor_plan import save_figure
     from wheretolook.tracking import TrackingConfig
     from wheretolook_paper.figures.runtimes import runtime_figure, scaling_figure
-    from wheretolook_paper.release.benchmark_runs import RUNTIMES_CSV, SCALING_CSV, log_runtimes
+    from wheretolook_paper.release.runs import RUNTIMES_CSV, SCALING_CSV, log_runtimes
 
     tables = [pd.read_csv(file) for file in args.draw if file.endswith(".csv")]
     results = [json.loads(Path(file).read_text()) for file in args.draw if not file.endswith(".csv")]

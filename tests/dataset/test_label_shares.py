@@ -66,7 +66,6 @@ def test_logged_numbers_are_those_of_the_tables(dataset, tmp_path):
     tracking = TrackingConfig(str(tmp_path / "mlruns"))
     shares = log_labels(dataset, tracking, {"render": 1.5, "label": 20.0})
     run = newest_run(tracking, "label", {"dataset": "hut"})
-    assert run is not None
     params = {"dataset": "hut", "dataset_fingerprint": dataset.fingerprint()}
     assert run.data.params == params | {"scenes": "scene-0 scene-1 scene-2"}
     metrics = run.data.metrics

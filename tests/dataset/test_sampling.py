@@ -1,10 +1,9 @@
 """Choosing viewpoints by what they see."""
 
-from dataclasses import replace
-
 import numpy as np
 import pandas as pd
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from synthetic_dataset import make_landmarks
 from wheretolook.dataset.sampling import sample_viewpoints
@@ -26,7 +25,7 @@ def landmarks():
     """A wall at x = 5."""
     rng = np.random.default_rng(0)
     points = np.column_stack([np.full(300, 5.0), rng.uniform(-3, 3, 300), rng.uniform(0, 2, 300)])
-    return replace(make_landmarks(rng, 300), points=points)
+    return make_landmarks(rng, 300, points=points)
 
 
 def sampled(landmarks, **options):
@@ -40,21 +39,27 @@ def test_rows_say_what_their_viewpoint_sees(landmarks):
     seen = transform(poses(table), landmarks.points)
     inside = (seen[..., 2] > 1e-3) & CAMERA.in_image(CAMERA.project(seen))
     assert np.abs(inside.sum(1) - table["n_visible"]).max() <= 1  # single precision at the border
-    np.testing.assert_allclose(camera_centers(poses(table)), GRID.centers()[table["location_id"]], atol=1e-12)
-    np.testing.assert_allclose(poses(table)[:, 2, :3], fibonacci_sphere(100)[table["direction_id"]], atol=1e-12)
+    assert_allclose(camera_centers(poses(table)), GRID.centers()[table["location_id"]], atol=1e-12)
+    assert_allclose(poses(table)[:, 2, :3], fibonacci_sphere(100)[table["direction_id"]], atol=1e-12)
     assert (table["viewpoint_id"] == table["location_id"] * 100 + table["direction_id"]).all()
 
 
-def test_a_share_of_the_viewpoints_is_near_mapping_images(landmarks):
+MAPPED = poses_looking_along(np.array([[-1.5, -1.5, 1.0], [-1.5, 1.5, 1.0]]), np.array([[0.5, 1, 0]] * 2))
+
+
+def sampled_near(landmarks, **options):
+    """Half of 60 locations are near `MAPPED`."""
     grid = VoxelGrid((-2.0, -2.0, 0.0), (2.0, 2.0, 2.0), (20, 20, 10))
-    mapped = poses_looking_along(np.array([[-1.5, -1.5, 1.0], [-1.5, 1.5, 1.0]]), np.eye(3)[[0, 0]])
-    config = SampleConfig(directions=400, keep=0, min_visible=0, max_locations=60, max_directions=8, near_map=0.5)
-    arguments = (grid, np.arange(len(grid)), landmarks, CAMERA, NoOcclusion(), config)
-    table, _ = sample_viewpoints(*arguments, mapped=mapped)
+    config = SampleConfig(directions=400, max_locations=60, near_map=0.5, **options)
+    return sample_viewpoints(grid, np.arange(len(grid)), landmarks, CAMERA, NoOcclusion(), config, mapped=MAPPED)[0]
+
+
+def test_a_share_of_the_viewpoints_is_near_mapping_images(landmarks):
+    table = sampled_near(landmarks, keep=0, min_visible=0, max_directions=8)
     assert table.groupby("location_id").size().eq(8).all() and table["location_id"].nunique() == 60
     centers = camera_centers(poses(table))
-    distance_m = np.linalg.norm(centers[:, None] - camera_centers(mapped), axis=2).min(1)
-    ahead = poses(table)[:, 2, 0]  # cosine to the axis of both images
+    distance_m = np.linalg.norm(centers[:, None] - camera_centers(MAPPED), axis=2).min(1)
+    ahead = poses(table)[:, 2, :3] @ MAPPED[0, 2, :3]  # cosine to the axis of both images
     near = pd.Series(ahead > np.cos(np.radians(40))).groupby(table["location_id"]).all()
     assert 20 <= near.sum() <= 30  # of 30 draws some share a voxel; of the others eight random directions never agree
     distance_m = pd.Series(distance_m).groupby(table["location_id"]).first()
@@ -63,15 +68,7 @@ def test_a_share_of_the_viewpoints_is_near_mapping_images(landmarks):
 
 
 def test_near_map_and_keep_take_the_best_of_the_directions_near_those_of_images(landmarks):
-    grid = VoxelGrid((-2.0, -2.0, 0.0), (2.0, 2.0, 2.0), (20, 20, 10))
-    mapped = poses_looking_along(np.array([[-1.5, -1.5, 1.0], [-1.5, 1.5, 1.0]]), np.array([[0.5, 1, 0]] * 2))
-    options = {"directions": 400, "max_locations": 60, "near_map": 0.5}
-    tables = []
-    for keep in (0, 5):
-        config = SampleConfig(**options, keep=keep)
-        arguments = (grid, np.arange(len(grid)), landmarks, CAMERA, NoOcclusion(), config)
-        tables.append(sample_viewpoints(*arguments, mapped=mapped)[0])
-    everything, best = tables
+    everything, best = (sampled_near(landmarks, keep=keep) for keep in (0, 5))
     assert everything["location_id"].nunique() == best["location_id"].nunique() == 60
     expected = everything.sort_values("visibility_rank").groupby("location_id").head(5).sort_values("viewpoint_id")
     pd.testing.assert_frame_equal(best, expected.reset_index(drop=True))
@@ -95,7 +92,7 @@ def test_each_location_looks_with_one_of_several_cameras(landmarks):
         alone, same = sample_viewpoints(GRID, ids, landmarks, camera, NoOcclusion(), config)
         rows = (table["camera_id"] == number).to_numpy()
         pd.testing.assert_frame_equal(table[rows].drop(columns="camera_id"), alone[rows])
-        np.testing.assert_array_equal(occlusion.packed, same.packed)
+        assert_array_equal(occlusion.packed, same.packed)
 
 
 def test_the_best_directions_are_kept_and_ranked(landmarks):

@@ -3,6 +3,7 @@
 import numpy as np
 import pandas as pd
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from wheretolook.dataset.viewpoint_files import MATCH_FIELDS, SCHEMA, read_table, write_table
 from wheretolook.dataset.viewpoint_table import is_good, pose_columns, poses
@@ -36,7 +37,7 @@ def test_round_trip_and_equal_bytes(table, tmp_path):
     write_table(table, tmp_path / "b.parquet")
     back = read_table(tmp_path / "a.parquet")
     assert list(back.columns) == SCHEMA.names
-    np.testing.assert_allclose(poses(back), poses(table), atol=1e-15)
+    assert_allclose(poses(back), poses(table), atol=1e-15)
     assert fingerprint(tmp_path / "a.parquet") == fingerprint(tmp_path / "b.parquet")
     assert not list(tmp_path.glob("*.partial"))
 
@@ -97,12 +98,12 @@ def test_a_compact_table_reads_the_same(many, tmp_path):
     before = read_table(plain)
     translation = ["tx", "ty", "tz"]
     pd.testing.assert_frame_equal(back.drop(columns=translation), before.drop(columns=translation))
-    np.testing.assert_allclose(back[translation], before[translation], rtol=0, atol=1e-12)
+    assert_allclose(back[translation], before[translation], rtol=0, atol=1e-12)
     # the centre of a location is stored once, where anyone reads it without arithmetic
     columns = pd.read_parquet(compact)
     assert columns.groupby("location_id")[["x_m", "y_m", "z_m"]].nunique().to_numpy().max() == 1
     centers = camera_centers(poses(before))
-    np.testing.assert_allclose(columns[["x_m", "y_m", "z_m"]], centers, rtol=0, atol=1e-12)
+    assert_allclose(columns[["x_m", "y_m", "z_m"]], centers, rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("name", ["appearance", "changes"])
@@ -112,7 +113,7 @@ def test_strengths_are_kept(compact, name, many, tmp_path):
     write_table(many.assign(**{name: strengths}), tmp_path / "a.parquet", compact)
     back = read_table(tmp_path / "a.parquet")
     assert [*back] == [*SCHEMA.names, name]
-    np.testing.assert_array_equal(back[name].to_numpy(), strengths)
+    assert_array_equal(back[name].to_numpy(), strengths)
 
 
 @pytest.mark.parametrize("compact", [False, True])

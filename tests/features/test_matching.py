@@ -6,13 +6,15 @@ import sys
 
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 from numpy.typing import NDArray
 
 from twins.features import nearest
 from wheretolook.features import matching
+from wheretolook.features import matching as descriptor_index
 from wheretolook.features.extractor import quantize_descriptors, unit_descriptors
 from wheretolook.features.matches import match
-from wheretolook.features.matching import DescriptorMatcher
+from wheretolook.features.matching import MAX_NEAREST, DescriptorIndex, DescriptorMatcher, has_index
 
 Descriptors = NDArray[np.uint8]
 
@@ -50,15 +52,15 @@ def assert_nearest(device, queries, landmarks, count=2):
     assert rows.dtype == products.dtype == np.int64 and rows.shape == products.shape == (len(queries), count)
     plain_rows, plain_products = nearest(queries, landmarks, count + 1)
     there = min(count, len(landmarks))
-    np.testing.assert_array_equal(products[:, :there], plain_products[:, :there])
+    assert_array_equal(products[:, :there], plain_products[:, :there])
     assert (products[:, there:] < -(2**27)).all()
     of_named = (queries.astype(np.int64)[:, None] * landmarks[rows[:, :there]]).sum(2)
-    np.testing.assert_array_equal(of_named, plain_products[:, :there])
+    assert_array_equal(of_named, plain_products[:, :there])
     # of several equally near, any may be named
     padded = np.pad(plain_products[:, :there], ((0, 0), (1, 1)), constant_values=-1)
     padded[:, -1] = plain_products[:, there] if plain_products.shape[1] > there else -1
     apart = (padded[:, 1:-1] != padded[:, :-2]) & (padded[:, 1:-1] != padded[:, 2:])
-    np.testing.assert_array_equal(rows[:, :there][apart], plain_rows[:, :there][apart])
+    assert_array_equal(rows[:, :there][apart], plain_rows[:, :there][apart])
 
 
 @KINDS
@@ -119,3 +121,36 @@ def test_a_cpu_whose_byte_products_saturate_finds_the_same(instructions):
         "print('done')\n"
     )
     assert run_python(code, ONEDNN_MAX_CPU_ISA=instructions) == "done"
+
+
+# Nearest landmarks of a large map by an index, next to the exact search.
+
+
+def stored(values):
+    """Descriptors (N, 128) uint8 of length 512."""
+    positive = np.abs(values)
+    return np.round(512 * positive / np.linalg.norm(positive, axis=1, keepdims=True)).astype(np.uint8)
+
+
+def test_the_index_finds_what_the_exact_search_finds(rng):
+    pytest.importorskip("faiss")
+    kinds = rng.normal(size=(200, 128)) ** 3  # landmarks are of 200 kinds that look alike
+    landmarks = stored(kinds[rng.integers(0, 200, 8000)] + 0.6 * rng.normal(size=(8000, 128)))
+    queries = stored(landmarks[:500] + rng.normal(0, 8, (500, 128)))
+    index, exact = DescriptorIndex(landmarks, lists=64), DescriptorMatcher(landmarks)
+    rows, squared = index.nearest(queries, MAX_NEAREST)
+    true_rows, _ = exact.nearest(queries, MAX_NEAREST)
+    assert rows.shape == squared.shape == (500, MAX_NEAREST) and (np.diff(squared) >= 0).all()
+    differences = landmarks[rows].astype(np.int64) * queries[:, None]
+    np.testing.assert_array_equal(squared, np.maximum(2 * (512**2 - differences.sum(-1)), 0))
+    assert (rows[:, 0] == true_rows[:, 0]).mean() > 0.9
+    found, expected = (match(matcher, [queries, queries[:0]], 0.85, MAX_NEAREST) for matcher in (index, exact))
+    assert len(np.intersect1d(found[0].landmarks, expected[0].landmarks)) > 0.97 * len(expected[0].landmarks) > 150
+    assert len(found[1].keypoints) == 0
+
+
+def test_an_index_serves_large_maps_on_a_cpu(monkeypatch, caplog):
+    monkeypatch.setattr(descriptor_index, "find_spec", lambda name: object())
+    assert has_index(1_000_000, "cpu") and not has_index(1_000_000, "cuda:0") and not has_index(25_000, "cpu")
+    monkeypatch.setattr(descriptor_index, "find_spec", lambda name: None)
+    assert not has_index(1_000_000, "cpu") and "wheretolook[large]" in caplog.text

@@ -1,5 +1,6 @@
 """Cameras by their options, their files and their errors; pinholes of any focal lengths against OpenCV."""
 
+import cv2
 import numpy as np
 import pytest
 
@@ -8,13 +9,16 @@ from wheretolook.geometry.camera import (
     ColmapCamera,
     PinholeCamera,
     camera_of_record,
+    cameras_by_id,
     describe_camera,
     draw_camera,
     field_of_view_deg,
+    only_camera,
     read_cameras,
     write_cameras,
 )
-from wheretolook.utils.errors import ConfigError
+from wheretolook.mapping.colmap_model import read_model
+from wheretolook.utils.errors import ConfigError, MapError
 
 FISHEYE = ColmapCamera("OPENCV_FISHEYE", 640, 480, (220.0, 221.0, 318.0, 242.0, 0.01, -0.002, 0.0, 0.0))
 OFF_CENTER = PinholeCamera(1280, 720, 900.0, 910.0, (620.0, 371.0))
@@ -67,11 +71,72 @@ def test_invalid_cameras(options):
         _ = CameraConfig(**options).camera
 
 
-def test_drawn_cameras_span_common_sizes_and_angles():
-    rng = np.random.default_rng(0)
+def test_drawn_cameras_span_common_sizes_and_angles(rng):
     drawn = [draw_camera(rng) for _ in range(400)]
     longer = np.array([max(camera.width, camera.height) for camera in drawn])
     angle = 2 * np.degrees(np.arctan(longer / 2 / [camera.fx for camera in drawn]))
     assert 320 <= longer.min() < 340 and 1200 < longer.max() <= 1280
     assert 40 - 0.1 < angle.min() < 43 and 117 < angle.max() < 120.1
     assert any(camera.height > camera.width for camera in drawn)
+
+
+# Cameras of COLMAP's models against pycolmap and OpenCV.
+
+
+def test_opencv_model_projects_as_opencv():
+    params = (300.0, 310.0, 330.0, 235.0, -0.2, 0.05, 1e-3, -1e-3)
+    camera = ColmapCamera("OPENCV", 640, 480, params)
+    points = np.random.default_rng(0).uniform((-1, -0.7, 1), (1, 0.7, 2), (200, 3))
+    matrix = np.array([[params[0], 0, params[2]], [0, params[1], params[3]], [0, 0, 1]])
+    expected, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), matrix, np.array(params[4:]))
+    seen = camera.sees(points)
+    assert seen.mean() > 0.9
+    np.testing.assert_allclose(camera.project(points)[seen], expected[seen, 0], atol=1e-9)
+
+
+def test_distortion_that_turns_back_does_not_bring_the_side_into_view():
+    """With k1 = -0.25 the image of a ray 61 degrees off the axis falls left of the image's edge again."""
+    import pycolmap
+
+    params = [320.0, 320.0, 240.0, -0.25, 0.0]
+    ray = np.array([[np.tan(np.radians(61)), 0, 1]])
+    raw = pycolmap.Camera(model="RADIAL", width=640, height=480, params=params).img_from_cam(ray)
+    camera = ColmapCamera("RADIAL", 640, 480, tuple(params))
+    assert 0 < raw[0, 0] < 640 and not camera.sees(ray)[0]
+    assert camera.sees(np.array([[np.tan(np.radians(45)), 0, 1]]))[0]
+
+
+def test_a_panorama_sees_everything_and_a_fisheye_what_is_in_its_image():
+    directions = np.random.default_rng(0).normal(size=(1000, 3))
+    assert ColmapCamera("EQUIRECTANGULAR", 640, 320, (640.0, 320.0)).sees(directions).all()
+    fisheye = ColmapCamera("SIMPLE_FISHEYE", 400, 400, (200 / np.radians(70), 200.0, 200.0))
+    off_axis = np.degrees(np.arccos(directions[:, 2] / np.linalg.norm(directions, axis=1)))
+    along_x = np.array([[np.sin(np.radians(a)), 0, np.cos(np.radians(a))] for a in (0, 69.9, 70.1)])
+    assert fisheye.sees(along_x).tolist() == [True, True, False]
+    assert not fisheye.sees(directions[off_axis > 100]).any()
+
+
+def test_not_a_number_and_the_centre_are_not_seen():
+    camera = ColmapCamera("OPENCV", 640, 480, (300.0, 300.0, 320.0, 240.0, 0.0, 0.0, 0.0, 0.0))
+    assert camera.sees(np.array([[0, 0, 0], [np.nan, 0, 1], [0, 0, np.inf], [0, 0, -1], [0, 0, 1.0]])).tolist() == [
+        False, False, False, False, True,
+    ]  # fmt: skip
+
+
+def test_the_camera_of_a_map(tmp_path):
+    import pycolmap
+
+    model = pycolmap.Reconstruction()
+    model.add_camera(
+        pycolmap.Camera(model="RADIAL", width=640, height=480, params=[500, 320, 240, 0.1, 0.01], camera_id=1)
+    )
+    model.write(tmp_path)
+    camera = ColmapCamera("RADIAL", 640, 480, (500.0, 320.0, 240.0, 0.1, 0.01))
+    assert only_camera(cameras_by_id(read_model(tmp_path).cameras, tmp_path), tmp_path) == camera
+    model.add_camera(pycolmap.Camera(model="SIMPLE_PINHOLE", width=64, height=48, params=[50, 32, 24], camera_id=2))
+    model.write(tmp_path)
+    assert cameras_by_id(read_model(tmp_path).cameras, tmp_path) == {1: camera, 2: PinholeCamera(64, 48, 50.0)}
+    with pytest.raises(MapError):
+        only_camera(cameras_by_id(read_model(tmp_path).cameras, tmp_path), tmp_path)
+    with pytest.raises(MapError):
+        read_model(tmp_path / "nowhere")

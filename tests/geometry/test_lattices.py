@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial import cKDTree
 
 from wheretolook.geometry.lattices import (
@@ -32,7 +33,7 @@ def test_fibonacci_covers_the_sphere_three_times_finer_than_the_released_lattice
 @pytest.mark.parametrize("n", [1, 2, 50, 500])
 def test_lattices_are_distinct_unit_vectors(lattice, n):
     directions = direction_lattice(n, lattice)
-    np.testing.assert_allclose(np.linalg.norm(directions, axis=1), 1, atol=1e-12)
+    assert_allclose(np.linalg.norm(directions, axis=1), 1, atol=1e-12)
     assert len(np.unique(directions.round(9), axis=0)) == len(directions)
 
 
@@ -41,21 +42,21 @@ def test_the_benchmarks_yaws_and_pitches():
     assert directions.shape == (108, 3)
     pitches = np.degrees(np.arcsin(directions[:, 2])).round(9)
     assert np.unique(pitches).tolist() == [-60, -40, -20, 0, 20, 40]
-    np.testing.assert_allclose(axes_of_angles([[0, 0], [90, 0], [0, 90]]), np.eye(3), atol=1e-15)
-    np.testing.assert_allclose(axes_of_angles(yaw_pitch_angles()), directions)
+    assert_allclose(axes_of_angles([[0, 0], [90, 0], [0, 90]]), np.eye(3), atol=1e-15)
+    assert_allclose(axes_of_angles(yaw_pitch_angles()), directions)
 
 
 def test_centres_and_ids_are_inverse():
     grid = VoxelGrid.over([[-1, 0, 2], [3, 2, 5]], (8, 4, 3))
     assert len(grid) == 96
-    np.testing.assert_allclose(grid.centers()[0], [-0.75, 0.25, 2.5])
-    np.testing.assert_array_equal(grid.location_ids(grid.centers()), np.arange(96))
+    assert_allclose(grid.centers()[0], [-0.75, 0.25, 2.5])
+    assert_array_equal(grid.location_ids(grid.centers()), np.arange(96))
 
 
 def test_points_outside_have_no_voxel_and_the_upper_face_has_one():
     grid = VoxelGrid.over([[0, 0, 0], [1, 1, 1]], (2, 2, 2))
     points = [[-1e-9, 0.5, 0.5], [0.5, 1.1, 0.5], [np.nan, 0.5, 0.5], [1, 1, 1], [0, 0, 0]]
-    np.testing.assert_array_equal(grid.location_ids(points), [-1, -1, -1, 7, 0])
+    assert_array_equal(grid.location_ids(points), [-1, -1, -1, 7, 0])
 
 
 @pytest.mark.parametrize(("upper", "shape"), [((1, 0, 1), (8, 8, 8)), ((1, 1, 1), (8, 0, 8))])

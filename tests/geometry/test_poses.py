@@ -3,6 +3,7 @@
 import numpy as np
 import pycolmap
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
 from wheretolook.geometry import poses as geo
@@ -19,32 +20,28 @@ def test_inverse_and_centres():
     points = np.random.default_rng(1).normal(size=(7, 3))
     there = geo.transform(poses, points)
     back = np.stack([geo.transform(inverse, x) for inverse, x in zip(geo.invert_poses(poses), there, strict=True)])
-    np.testing.assert_allclose(back, np.broadcast_to(points, back.shape), atol=1e-12)
+    assert_allclose(back, np.broadcast_to(points, back.shape), atol=1e-12)
     centers = geo.camera_centers(poses)
-    np.testing.assert_allclose(np.einsum("bij,bj->bi", poses[..., :3], centers) + poses[..., 3], 0, atol=1e-12)
+    assert_allclose(np.einsum("bij,bj->bi", poses[..., :3], centers) + poses[..., 3], 0, atol=1e-12)
 
 
 def test_quaternions_agree_with_pycolmap_and_scipy():
     rotation = random_poses(50)[..., :3]
     quaternion = geo.quaternion_from_rotation(rotation)
     for q, r in zip(quaternion, rotation, strict=True):
-        np.testing.assert_allclose(pycolmap.Rotation3d(np.roll(q, -1)).matrix(), r, atol=1e-12)
+        assert_allclose(pycolmap.Rotation3d(np.roll(q, -1)).matrix(), r, atol=1e-12)
     assert (quaternion[:, 0] >= 0).all()
-    np.testing.assert_allclose(geo.rotation_from_quaternion(2 * quaternion), rotation, atol=1e-12)
+    assert_allclose(geo.rotation_from_quaternion(2 * quaternion), rotation, atol=1e-12)
 
 
 def test_looking_along_keeps_the_horizon_level_and_down_down():
     directions = np.random.default_rng(2).normal(size=(200, 3))
     directions[:2, :2] = 0  # straight up or down
     rotation = geo.rotation_looking_along(directions)
-    np.testing.assert_allclose(
-        rotation @ np.swapaxes(rotation, 1, 2), np.broadcast_to(np.eye(3), rotation.shape), atol=1e-12
-    )
-    np.testing.assert_allclose(np.linalg.det(rotation), 1)
-    np.testing.assert_allclose(
-        rotation[:, 2], directions / np.linalg.norm(directions, axis=1, keepdims=True), atol=1e-12
-    )
-    np.testing.assert_allclose(rotation[:, 0, 2], 0, atol=1e-12)
+    assert_allclose(rotation @ np.swapaxes(rotation, 1, 2), np.broadcast_to(np.eye(3), rotation.shape), atol=1e-12)
+    assert_allclose(np.linalg.det(rotation), 1)
+    assert_allclose(rotation[:, 2], directions / np.linalg.norm(directions, axis=1, keepdims=True), atol=1e-12)
+    assert_allclose(rotation[:, 0, 2], 0, atol=1e-12)
     assert (rotation[2:, 1, 2] < 0).all()
 
 
@@ -78,7 +75,7 @@ def test_rigid_transforms_of_any_shape_and_no_others():
     poses = random_poses(2)
     square = np.concatenate([poses, np.broadcast_to([0.0, 0, 0, 1], (2, 1, 4))], axis=1)
     for given, expected in ((poses, poses), (square, poses), (poses[1], poses[1:]), (square[1], poses[1:])):
-        np.testing.assert_array_equal(geo.rigid_poses(given), expected)
+        assert_array_equal(geo.rigid_poses(given), expected)
     mirrored = poses * np.array([-1, 1, 1])[:, None]
     sheared = poses + np.eye(3, 4, 1) * 0.1
     for invalid in (
@@ -105,7 +102,7 @@ def test_invalid_locations_and_poses():
         with pytest.raises(PoseError):
             geo.rigid_poses(given)
     same = geo.poses_looking_along([(0, 0, 1), (0, 1, 1)], [(1, 0, 0)] * 2)
-    np.testing.assert_array_equal(geo.poses_looking_along([(0, 0, 1), (0, 1, 1)], (1, 0, 0)), same)
+    assert_array_equal(geo.poses_looking_along([(0, 0, 1), (0, 1, 1)], (1, 0, 0)), same)
     for poses in (np.stack([np.eye(3, 4), np.full((3, 4), np.nan)]), np.eye(4)):
         with pytest.raises(PoseError):
             geo.check_poses(poses)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from depth_room import depth_images, room
 from wheretolook.geometry.camera import ColmapCamera, PinholeCamera
@@ -26,7 +27,7 @@ def test_the_surface_lies_where_the_mesh_is(volume):
     assert np.quantile(distance, 0.95) < 0.005
     again = volume.surface()  # extracting has left the volume as it was, but for rounding
     assert len(again.triangles) == pytest.approx(len(surface.triangles), rel=1e-4)
-    np.testing.assert_allclose(again.vertices.mean(0), surface.vertices.mean(0), atol=1e-4)
+    assert_allclose(again.vertices.mean(0), surface.vertices.mean(0), atol=1e-4)
 
 
 def test_a_depth_camera_may_have_two_focal_lengths_and_its_own_centre():
@@ -35,8 +36,8 @@ def test_a_depth_camera_may_have_two_focal_lengths_and_its_own_centre():
     camera = ColmapCamera("PINHOLE", 320, 240, (200.0, 210.0, 155.0, 118.0))
     points = DepthImage(depth, camera, pose).points(10.0)
     rows, columns = np.divmod(np.arange(320 * 240), 320)
-    np.testing.assert_allclose(camera.project(points), np.column_stack([columns + 0.5, rows + 0.5]), atol=1e-4)
-    np.testing.assert_allclose(points[:, 2], depth.ravel(), rtol=1e-6)
+    assert_allclose(camera.project(points), np.column_stack([columns + 0.5, rows + 0.5]), atol=1e-4)
+    assert_allclose(points[:, 2], depth.ravel(), rtol=1e-6)
     with pytest.raises(ConfigError):
         DepthImage(depth, ColmapCamera("RADIAL", 320, 240, (200.0, 160.0, 120.0, 0.1, 0.0)), pose)
 

@@ -1,8 +1,8 @@
 """A COLMAP model of a corridor, whose photographs, landmarks and descriptors are known; and its database."""
 
 import numpy as np
-import pycolmap
 
+from colmap_models import camera, model_of
 from wheretolook.features.extractor import SIFT
 from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.mapping.triangulation import fill_database
@@ -34,38 +34,31 @@ def write_corridor(folder, noise_px=0.2, photographs=N, scale=1.0, rotation=np.e
     words = rng.gamma(0.5, size=(len(points), kind.dimension))
     if not kind.in_bytes:
         words = rng.normal(size=words.shape)
-    model = pycolmap.Reconstruction()
-    for camera_id, (name, params) in enumerate(
-        [("PINHOLE", [160.0, 160.0, 160.0, 120.0]), ("SIMPLE_RADIAL", [160.0, 160.0, 120.0, -0.02])], 1
-    ):
-        camera = pycolmap.Camera(camera_id=camera_id, model=name, width=WIDTH, height=HEIGHT, params=params)
-        model.add_camera_with_trivial_rig(camera)
+    cameras = [
+        camera(1, "PINHOLE", WIDTH, HEIGHT, 160, 160, 160, 120),
+        camera(2, "SIMPLE_RADIAL", WIDTH, HEIGHT, 160, 160, 120, -0.02),
+    ]
+    images = []
     stored = []
-    seen_by = [list[tuple[int, int]]() for _ in points]
+    tracks = [[] for _ in points]
     for row, pose in enumerate(corridor_poses()[:photographs]):
-        camera = model.cameras[1 + row % 2]
+        taken_with = cameras[row % 2]
         in_camera = points @ pose[:, :3].T + pose[:, 3]
         ahead = np.flatnonzero(in_camera[:, 2] > 0.1)
-        pixels = np.asarray(camera.img_from_cam(in_camera[ahead]))
+        pixels = np.asarray(taken_with.img_from_cam(in_camera[ahead]))
         inside = ((pixels > 0) & (pixels < (WIDTH, HEIGHT))).all(1)
         rows = ahead[inside]
-        pixels = pixels[inside] + rng.normal(0, noise_px, (int(inside.sum()), 2))
+        pixels = (pixels[inside] + rng.normal(0, noise_px, (int(inside.sum()), 2))).astype(np.float32)
         noisy = words[rows] + rng.normal(0, 0.05, (len(rows), kind.dimension))
         noisy = np.maximum(noisy, 0) if kind.in_bytes else noisy
-        stored.append((pixels.astype(np.float32), kind.store(noisy / np.linalg.norm(noisy, axis=1)[:, None])))
-        image = pycolmap.Image(
-            name=f"{row:03}.jpg", camera_id=camera.camera_id, image_id=row + 1, keypoints=stored[-1][0].astype(float)
-        )
+        stored.append((pixels, kind.store(noisy / np.linalg.norm(noisy, axis=1)[:, None])))
         moved = np.column_stack([pose[:, :3] @ rotation.T, scale * pose[:, 3]])
-        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(moved))
+        images.append((f"{row:03}.jpg", taken_with.camera_id, moved, pixels.astype(float)))
         for keypoint, point in enumerate(rows):
-            seen_by[point].append((row + 1, keypoint))
-    for point, seen in enumerate(seen_by):
-        if len(seen) > 1:
-            track = pycolmap.Track()
-            for image_id, keypoint in seen:
-                track.add_element(image_id, keypoint)
-            model.add_point3D(scale * points[point] @ rotation.T, track, np.zeros(3, dtype=np.uint8))
+            tracks[point].append((row, keypoint))
+    moved = scale * points @ rotation.T
+    seen = [(xyz, track) for xyz, track in zip(moved, tracks, strict=True) if len(track) > 1]
+    model = model_of(cameras, images, seen)
     model.update_point_3d_errors()
     sparse = folder / "sparse"
     database = folder / ("features.db" if kind is SIFT else f"{kind.name}.db")

@@ -224,14 +224,6 @@ def test_the_advice_follows_from_order_values_and_range(auc, ece, in_range, expe
     assert advice.startswith(expected) or advice.endswith(expected)
 
 
-def test_other_methods_are_printed(corridor, checked, tmp_path, capsys):
-    shutil.copytree(checked, tmp_path / "out")
-    run(_arguments(*corridor, tmp_path / "out", "--scale", "1", "--also", "bins"))
-    printed = capsys.readouterr().out
-    auc = json.loads((checked / "check.json").read_text())["methods"]["bins"]["auc"]["value"]
-    assert f"bins picks the better one {100 * auc:.0f} times in 100" in printed
-
-
 def test_narrower_views_of_photographs(corridor, checked, tmp_path):
     """Three views of each photograph, fewer of which localize; the table of photographs has the middle ones."""
     run(_arguments(*corridor, tmp_path / "out", "--scale", "1", "--fov", "25"))

@@ -1,17 +1,24 @@
 """Landmarks of views described one by one, and pooled, against NumPy view by view."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
+from numpy.testing import assert_allclose, assert_array_equal
 
+from box_scenes import furnished_room
+from selection.room import POINTS, write_room
 from synthetic_dataset import CAMERA, make_landmarks
 from wheretolook.geometry.camera import ColmapCamera
+from wheretolook.geometry.lattices import direction_lattice
 from wheretolook.geometry.poses import poses_looking_along, transform
 from wheretolook.inputs.channels import ATTRIBUTES, POSE_ATTRIBUTES
-from wheretolook.inputs.landmark_features import LandmarkDescriber
+from wheretolook.inputs.landmark_features import LandmarkDescriber, ReasonCounter
 from wheretolook.inputs.localization_map import LocalizationMap, shared_locations
 from wheretolook.mapping.landmarks import MAP_ATTRIBUTES
 from wheretolook.mapping.map import Map
+from wheretolook.scenes.loading import save_glb
 from wheretolook.visibility.occlusion import StoredOcclusion
 
 COLMAP = ColmapCamera("OPENCV", 160, 120, (80.0, 80.0, 80.0, 60.0, -0.1, 0.01, 1e-3, -1e-3))
@@ -39,8 +46,8 @@ def test_each_landmark_by_hand(localization_map):
     visible = localization_map.landmarks_in_view(views)
     assert len(described) == 50 and described.counts.tolist() == np.diff(visible.starts).tolist()
     assert described.counts.min() == 0 and described.counts.max() > 50
-    np.testing.assert_array_equal(described.rows.cpu(), visible.indices)
-    np.testing.assert_array_equal(described.views.cpu(), np.repeat(np.arange(50), np.diff(visible.starts)))
+    assert_array_equal(described.rows.cpu(), visible.indices)
+    assert_array_equal(described.views.cpu(), np.repeat(np.arange(50), np.diff(visible.starts)))
     for view, pose in enumerate(views):
         rows = visible[view]
         x, y, z = transform(pose, m.points[rows]).T
@@ -66,7 +73,7 @@ def test_each_landmark_by_hand(localization_map):
         }
         assert tuple(expected) == ATTRIBUTES == POSE_ATTRIBUTES + MAP_ATTRIBUTES
         found = described.values[described.starts[view] : described.starts[view + 1]].cpu()
-        np.testing.assert_allclose(found, np.stack([*expected.values()], axis=1), rtol=1e-4, atol=1e-5)
+        assert_allclose(found, np.stack([*expected.values()], axis=1), rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.parametrize("most", [None, 1, 20])
@@ -97,17 +104,41 @@ def test_views_share_locations_in_whatever_order_they_come():
         poses = poses_looking_along(places[order], rng.normal(size=(len(order), 3)))
         locations, rows = shared_locations(poses)
         assert len(locations) == len(set(order))
-        np.testing.assert_allclose(locations[rows], places[order], atol=1e-6)
+        assert_allclose(locations[rows], places[order], atol=1e-6)
 
 
-def test_one_view_is_described_and_thinned_as_it_is_among_others(localization_map):
-    poses = some_views()
-    describer = LandmarkDescriber(localization_map)
-    ((_, together, seen),) = describer.in_blocks(poses, 20)
-    assert int(seen.max()) > 20 == int(together.counts.max())
-    for view, pose in enumerate(poses):
-        ((_, alone, alone_seen),) = describer.in_blocks(pose[None], 20)
-        mine = together.views == view
-        assert alone.rows.tolist() == together.rows[mine].tolist()
-        torch.testing.assert_close(alone.values, together.values[mine], rtol=1e-5, atol=1e-5, equal_nan=True)
-        assert int(alone_seen[0]) == int(seen[view])
+# Landmarks that are hard to match are counted by their distance, angle, descriptor and line of sight.
+
+
+def test_counts_by_the_definitions(tmp_path):
+    save_glb(furnished_room(), tmp_path / "room.glb")
+    room = LocalizationMap.from_colmap(write_room(tmp_path / "sparse"), mesh=tmp_path / "room.glb")
+    mapped_m = room.landmarks.mapping_distance_m / 4  # so that some are twice as far
+    mapped_along = np.roll(room.landmarks.mapping_direction, 1, axis=0)  # and some oblique
+    ambiguity = np.linspace(0.9, 1.0, len(room.landmarks), dtype=np.float32)
+    changed = {"mapping_distance_m": mapped_m, "mapping_direction": mapped_along, "ambiguity": ambiguity}
+    room = replace(room, map=replace(room.map, landmarks=replace(room.landmarks, **changed)))
+    axes = direction_lattice(12)
+    poses = poses_looking_along(np.repeat(POINTS, 12, axis=0), np.tile(axes, (4, 1)))
+    counts = ReasonCounter(room).count(poses)
+    expected = np.zeros((len(poses), 4), dtype=int)
+    for row, pose in enumerate(poses):
+        local = room.landmarks.points @ pose[:, :3].T + pose[:, 3]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            x, y = (320 * local[:, :2] / local[:, 2:] + (320, 240)).T
+        in_image = (local[:, 2] > 0) & (x >= 0) & (x < 640) & (y >= 0) & (y < 480)
+        visible = room.landmarks_in_view(pose[None])[0]
+        rays = (local @ pose[:, :3])[visible]
+        distance = np.linalg.norm(rays, axis=1)
+        angle = np.degrees(np.arccos((rays * mapped_along[visible]).sum(1) / distance))
+        hard = distance > 2 * mapped_m[visible], angle > 45, ambiguity[visible] > 0.95
+        expected[row] = in_image.sum() - len(visible), *(reason.sum() for reason in hard)
+    found = np.column_stack([counts.n_occluded, counts.n_too_far, counts.n_too_oblique, counts.n_repeated])
+    np.testing.assert_array_equal(found, expected)
+    assert (expected.sum(0) > 0).all()
+
+
+def test_without_descriptors_repetition_is_unknown(tmp_path):
+    room = LocalizationMap.from_colmap(write_room(tmp_path / "sparse"))
+    counts = ReasonCounter(room).count(poses_looking_along(POINTS, np.tile((1.0, 0, 0), (4, 1))))
+    assert np.isnan(counts.n_repeated).all() and (counts.n_occluded == 0).all() and (counts.n_too_far >= 0).all()

@@ -17,7 +17,7 @@ from wheretolook.scenes.loading import load_mesh
 @pytest.fixture(scope="session")
 def room(tmp_path_factory):
     """No texture repeats: the room is 5 m long, and so is a texture."""
-    return map_room(tmp_path_factory.mktemp("room"), texture_scale=0.5)
+    return map_room(tmp_path_factory.mktemp("room"), texture_m=5.0)
 
 
 @pytest.fixture(scope="session")

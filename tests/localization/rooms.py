@@ -12,13 +12,14 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from mapping.conftest import ROOM_SIZE, BoxFreeSpace, box_room
-from one_scene import label_viewpoints
+from box_scenes import HIGH_X, LOW_X, ROOM_SIZE, box_room
+from mapping.conftest import BoxFreeSpace
 from wheretolook.dataset.viewpoint_files import SCHEMA, write_table
 from wheretolook.dataset.viewpoint_table import UNLABELLED, pose_columns
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.localization.config import LabelConfig
+from wheretolook.localization.labeller import LabelTask, label_scenes
 from wheretolook.localization.shard import SceneJob
 from wheretolook.mapping.config import MapConfig
 from wheretolook.mapping.rendered_map import build_map
@@ -27,8 +28,8 @@ from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.scenes.loading import load_mesh, save_glb
 
 CAMERA = PinholeCamera(320, 240, 160.0)
-PLAIN = 1  # the face x = high of `box_room`
-POSTER = 0  # the face x = 0
+PLAIN = HIGH_X
+POSTER = LOW_X
 
 
 @dataclass(frozen=True)
@@ -43,11 +44,9 @@ class MappedRoom:
         return SceneJob(self.mesh, self.landmarks, CAMERA)
 
 
-def map_room(folder, texture_scale):
-    mesh = box_room()
-    textures = list(mesh.textures)
-    textures[PLAIN] = np.full_like(textures[PLAIN], 200)
-    mesh = replace(mesh, textures=tuple(textures), corner_uvs=mesh.corner_uvs * np.float32(texture_scale))
+def map_room(folder, texture_m):
+    mesh = box_room(texture_m=texture_m)
+    mesh.textures[PLAIN][:] = 200
     save_glb(mesh, folder / "mesh.glb")
     mesh = load_mesh(folder / "mesh.glb")
     inputs = (mesh, WarpRenderer(mesh), BoxFreeSpace(), CAMERA, MapConfig(n_images=24))
@@ -70,11 +69,17 @@ def facing(wall, n, distance_m, seed=0):
     return viewpoints(locations, np.tile([1.0 if wall == PLAIN else -1.0, 0, 0], (n, 1)))
 
 
+def labelled(table, room, shards, **config):
+    """The table with its labels."""
+    config = LabelConfig(**config)
+    job = replace(room.job, store_matches=config.store_matches, appearance=config.appearance)
+    (scene,) = label_scenes([LabelTask("room", job, table, shards)], config, progress=False)
+    return scene.table
+
+
 def label(table, room, shards, **config):
     """Bytes of the labelled table's file."""
-    options = LabelConfig(**config)
-    labelled = label_viewpoints(table, room.mesh, room.landmarks, CAMERA, shards, options, progress=False)
-    return file_bytes(labelled, shards)
+    return file_bytes(labelled(table, room, shards, **config), shards)
 
 
 def file_bytes(table, folder):

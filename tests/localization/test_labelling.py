@@ -1,43 +1,42 @@
 """Labels of a room whose answers are known: a plain wall never localizes, a poster wall in the map always does."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
 import pandas as pd
 import pytest
+from numpy.testing import assert_allclose
 
-from localization.rooms import CAMERA, PLAIN, POSTER, facing, file_bytes, label, map_room, times
-from one_scene import label_viewpoints
+from localization.rooms import CAMERA, PLAIN, POSTER, facing, file_bytes, label, labelled, map_room, times
+from localization.test_joint import in_view
 from wheretolook.commands.options import MeshSource, ScenesConfig
 from wheretolook.commands.scenes import Scenes
-from wheretolook.dataset.viewpoint_files import FIRST_FIELDS, SCHEMA, read_table, write_table
-from wheretolook.dataset.viewpoint_table import LOCALIZED, by_first, is_good, poses
+from wheretolook.dataset.viewpoint_files import FIRST_FIELDS, MATCH_FIELDS, SCHEMA, read_table, write_table
+from wheretolook.dataset.viewpoint_table import LOCALIZED, TOO_FEW_MATCHES, by_first, is_good, poses
 from wheretolook.features.extractor import Keypoints
 from wheretolook.features.matches import Matches
 from wheretolook.geometry.camera import ColmapCamera, PinholeCamera
 from wheretolook.geometry.poses import pose_error, transform
 from wheretolook.localization.config import LabelConfig, LocalizerConfig
-from wheretolook.localization.labeller import LabelTask, label_scenes
+from wheretolook.localization.labeller import MANIFEST, LabelTask, label_scenes
 from wheretolook.localization.localizer import Localizer
 from wheretolook.localization.shard import label_rows
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.scenes.loading import load_mesh, save_glb
-from wheretolook.utils.errors import ConfigError, SceneError
+from wheretolook.utils.errors import ConfigError, SceneError, TableError
 
 
 @pytest.mark.usefixtures("in_this_process")
 def test_a_plain_wall_never_localizes_and_a_poster_wall_always_does(room, tmp_path):
     for wall, expected in ((PLAIN, 0.0), (POSTER, 1.0)):
-        table = facing(wall, 12, distance_m=1.1)
-        labelled = label_viewpoints(
-            table, room.mesh, room.landmarks, CAMERA, tmp_path, LabelConfig(workers=1), progress=False
-        )
-        assert is_good(labelled).mean() == expected
+        table = labelled(facing(wall, 12, distance_m=1.1), room, tmp_path, workers=1)
+        assert is_good(table).mean() == expected
         if wall == PLAIN:
-            assert labelled["error_m"].isna().all() and (labelled["n_inliers"] == 0).all()
+            assert table["error_m"].isna().all() and (table["n_inliers"] == 0).all()
         else:
-            assert (labelled["n_inliers"] >= 10).all() and labelled["error_m"].max() < 0.05
+            assert (table["n_inliers"] >= 10).all() and table["error_m"].max() < 0.05
 
 
 def test_batches_that_exceed_the_memory_are_halved(room, views, expected, tmp_path, caplog):
@@ -59,8 +58,8 @@ def test_batches_that_exceed_the_memory_are_halved(room, views, expected, tmp_pa
 
     localizer.extractor.extract_batch = extract_batch
     with caplog.at_level("WARNING"):
-        labelled = label_rows(views, room.job, localizer, SmallRenderer(load_mesh(room.mesh)))
-    assert file_bytes(labelled, tmp_path / "halved") == expected
+        table = label_rows(views, room.job, localizer, SmallRenderer(load_mesh(room.mesh)))
+    assert file_bytes(table, tmp_path / "halved") == expected
     assert "GPU memory does not suffice" in caplog.text
 
     def broken(images):
@@ -75,13 +74,12 @@ def test_batches_that_exceed_the_memory_are_halved(room, views, expected, tmp_pa
 @pytest.mark.usefixtures("in_this_process")
 def test_a_repeated_texture_localizes_at_the_wrong_copy_and_is_labelled_so(tmp_path):
     """On the 4 m long wall the texture repeats after 2.5 m: some poses are wrong by 2.5 m, with many inliers."""
-    room = map_room(tmp_path, texture_scale=1.0)
-    arguments = room.mesh, room.landmarks, CAMERA, tmp_path / "shards", LabelConfig(workers=1)
-    labelled = label_viewpoints(facing(POSTER, 12, distance_m=1.1), *arguments, progress=False)
-    wrong = labelled["error_m"] > 0.1
+    room = map_room(tmp_path, texture_m=2.5)
+    table = labelled(facing(POSTER, 12, distance_m=1.1), room, tmp_path / "shards", workers=1)
+    wrong = table["error_m"] > 0.1
     assert 0 < wrong.sum() < 12
-    np.testing.assert_allclose(labelled["error_m"][wrong], 2.5, atol=0.02)
-    assert labelled["n_inliers"][wrong].min() > 50 and not is_good(labelled)[wrong].any()
+    assert_allclose(table["error_m"][wrong], 2.5, atol=0.02)
+    assert table["n_inliers"][wrong].min() > 50 and not is_good(table)[wrong].any()
 
 
 def test_several_hypotheses_also_label_by_the_first_ransac_result(room, views, tmp_path):
@@ -115,9 +113,9 @@ def test_errors_are_measured_against_the_true_pose(room):
             moved[:, :, 3] += [0.0, 0.1, 0.0]  # 10 cm along the camera's y
             return super().render(camera, yaw @ moved)
 
-    labelled = label_rows(table, room.job, localizer, Elsewhere(load_mesh(room.mesh)))
-    np.testing.assert_allclose(labelled["error_m"], 0.1, atol=0.02)
-    np.testing.assert_allclose(labelled["error_deg"], 3.0, atol=0.2)
+    found = label_rows(table, room.job, localizer, Elsewhere(load_mesh(room.mesh)))
+    assert_allclose(found["error_m"], 0.1, atol=0.02)
+    assert_allclose(found["error_deg"], 3.0, atol=0.2)
 
 
 @pytest.mark.parametrize(
@@ -134,15 +132,15 @@ def test_a_pose_is_found_with_every_camera(room, camera):
     """Half of the matches are wrong."""
     landmarks = Landmarks.load(room.landmarks)
     (pose,) = poses(facing(POSTER, 1, distance_m=1.5))
-    pixels = camera.project(transform(pose[None], landmarks.points)[0])
-    rows = np.flatnonzero(camera.in_image(pixels) & (transform(pose[None], landmarks.points)[0][:, 2] > 0))[:300]
-    found = pixels[rows] + np.random.default_rng(0).normal(0, 0.3, (len(rows), 2))
+    rows, pixels = in_view(landmarks.points, pose, camera)
+    rows = rows[:300]
+    found = pixels[:300] + np.random.default_rng(0).normal(0, 0.3, (len(rows), 2))
     matched = rows.copy()
     matched[::2] = np.roll(matched[::2], 7)
     keypoints = replace(Keypoints.none(), pixels=found.astype(np.float32))
     matches = Matches.none(len(rows))._replace(keypoints=np.arange(len(rows)), landmarks=matched)
     estimate = Localizer(landmarks, CAMERA).estimate(keypoints, matches, camera)
-    assert estimate.cam_from_world is not None and estimate.status == LOCALIZED
+    assert estimate.status == LOCALIZED
     (error_m,), (error_deg,) = pose_error(estimate.cam_from_world[None], pose[None])
     assert error_m < 0.02 and error_deg < 0.3 and len(estimate.inlier_rows) >= 0.4 * len(rows)
 
@@ -152,14 +150,13 @@ def test_views_of_several_cameras_are_labelled_as_each_alone(room):
     table = facing(POSTER, 8, distance_m=1.5).assign(camera_id=np.array([4, 9, 9, 4, 4, 4, 9, 4], np.int32))
     renderer = WarpRenderer(load_mesh(room.mesh))
     localizer = Localizer(Landmarks.load(room.landmarks), CAMERA)
-    labelled = label_rows(table, replace(room.job, cameras=tuple(cameras.items())), localizer, renderer)
-    assert is_good(labelled).all() and labelled["viewpoint_id"].equals(table["viewpoint_id"])
+    together = label_rows(table, replace(room.job, cameras=tuple(cameras.items())), localizer, renderer)
+    assert is_good(together).all() and together["viewpoint_id"].equals(table["viewpoint_id"])
     for number, camera in cameras.items():
         rows = table["camera_id"] == number
-        alone = label_rows(
-            table[rows], replace(room.job, camera=camera), Localizer(localizer.landmarks, camera), renderer
-        )
-        pd.testing.assert_frame_equal(labelled[rows], alone)
+        job = replace(room.job, camera=camera)
+        alone = label_rows(table[rows], job, Localizer(localizer.landmarks, camera), renderer)
+        pd.testing.assert_frame_equal(together[rows], alone)
 
 
 @pytest.mark.usefixtures("in_this_process")
@@ -174,7 +171,7 @@ def test_appearances_depend_on_the_view_alone(room, views, tmp_path):
     assert label(table, room, tmp_path / "one", appearance=0.8, workers=1, shard_size=12) == changed
     back = read_table(tmp_path / "one-labelled.parquet")
     assert back["appearance"].between(0, 0.8).all() and back["appearance"].nunique() == 12
-    clean = label_viewpoints(back, room.mesh, room.landmarks, CAMERA, shards, LabelConfig(workers=1), progress=False)
+    clean = labelled(back, room, shards, workers=1)
     assert [*clean] == SCHEMA.names and is_good(clean).all()
     assert back["n_inliers"].sum() < clean["n_inliers"].sum()
 
@@ -187,22 +184,23 @@ def test_half_of_the_locations_show_the_changed_mesh(room, tmp_path):
     plain = replace(mesh, textures=tuple(np.full_like(texture, 128) for texture in mesh.textures))
     save_glb(plain, tmp_path / "changed.glb")
     job = replace(room.job, changes=0.4, changed_mesh=tmp_path / "changed.glb")
-    results = []
-    for size in (5, 24):
-        task = LabelTask("room", job, table, tmp_path / str(size))
-        (scene,) = label_scenes([task], LabelConfig(workers=1, shard_size=size), progress=False)
-        assert scene.manifest["changes"] == 0.4 and "changed_mesh" in scene.manifest
-        results.append(scene.table)
-    pd.testing.assert_frame_equal(*results)
-    labelled = results[0]
-    is_changed = labelled["changes"] > 0
-    assert set(labelled["changes"]) == {np.float32(0), np.float32(0.4)} and 4 <= is_changed.sum() <= 20
-    assert (labelled.groupby("location_id")["changes"].nunique() == 1).all()
-    assert is_good(labelled)[~is_changed].all() and (labelled["n_inliers"][is_changed] == 0).all()
+    (one,), (other,) = (
+        label_scenes(
+            [LabelTask("room", job, table, tmp_path / str(size))], LabelConfig(workers=1, shard_size=size), False
+        )
+        for size in (5, 24)
+    )
+    assert one.manifest["changes"] == 0.4 and "changed_mesh" in one.manifest
+    both = one.table
+    pd.testing.assert_frame_equal(both, other.table)
+    is_changed = both["changes"] > 0
+    assert set(both["changes"]) == {np.float32(0), np.float32(0.4)} and 4 <= is_changed.sum() <= 20
+    assert (both.groupby("location_id")["changes"].nunique() == 1).all()
+    assert is_good(both)[~is_changed].all() and (both["n_inliers"][is_changed] == 0).all()
     localizer = Localizer(Landmarks.load(room.landmarks), CAMERA)
     alone = label_rows(table[~is_changed], room.job, localizer, WarpRenderer(mesh))
-    pd.testing.assert_frame_equal(labelled[~is_changed].drop(columns="changes"), alone, check_dtype=False)
-    again = label_rows(labelled, room.job, localizer, WarpRenderer(mesh))
+    pd.testing.assert_frame_equal(both[~is_changed].drop(columns="changes"), alone, check_dtype=False)
+    again = label_rows(both, room.job, localizer, WarpRenderer(mesh))
     assert "changes" not in again and is_good(again).all()
 
 
@@ -216,14 +214,70 @@ def test_scenes_from_files_do_not_change(room, tmp_path):
     assert not (files.folder / "changed.glb").exists()
 
 
-@pytest.mark.parametrize("strength", [-0.1, 1.01, np.nan])
-def test_changes_beyond_0_and_1_are_refused(strength):
-    with pytest.raises(ConfigError, match=r"label\.changes"):
-        LabelConfig(changes=strength)
+@pytest.mark.parametrize("name", ["changes", "appearance"])
+@pytest.mark.parametrize("strength", [-0.1, 1.01, np.inf, np.nan])
+def test_strengths_beyond_0_and_1_are_refused(name, strength):
+    with pytest.raises(ConfigError, match=rf"label\.{name}"):
+        LabelConfig(**{name: strength})
 
 
-@pytest.mark.parametrize("strength", [-0.1, 1.01, 30.0, np.nan, np.inf])
-def test_appearances_beyond_0_and_1_are_refused(strength):
-    with pytest.raises(ConfigError, match=r"label\.appearance") as error:
-        LabelConfig(appearance=strength)
-    assert error.value.value is strength and error.value.fix
+# Matched landmarks stored with the labels: their rows, and that nothing else changes.
+
+
+def test_matched_rows_agree_with_the_labels(room, matched):
+    n = len(Landmarks.load(room.landmarks))
+    assert list(matched.columns) == [*SCHEMA.names, *MATCH_FIELDS.names]
+    for view in matched.itertuples():
+        assert view.matched_rows.dtype == view.inlier_rows.dtype == np.int32
+        assert len(view.inlier_rows) == view.n_inliers <= len(view.matched_rows)
+        assert (len(view.matched_rows) < 4) == (view.status == TOO_FEW_MATCHES)
+        assert np.isin(view.inlier_rows, view.matched_rows).all()
+        for rows in (view.matched_rows, view.inlier_rows):
+            assert (np.diff(rows) > 0).all() and ((rows >= 0) & (rows < n)).all()
+    lengths = matched["matched_rows"].map(len)
+    assert lengths.min() == 0 and (lengths > matched["n_inliers"]).any() and matched["n_inliers"].max() > 50
+
+
+def test_labels_are_the_same_with_and_without(views, matched, expected, tmp_path):
+    assert file_bytes(matched.drop(columns=MATCH_FIELDS.names), tmp_path / "bare") == expected
+
+
+@pytest.mark.usefixtures("in_this_process")
+def test_shards_with_and_without_matches_have_names_of_their_own(room, tmp_path):
+    """Shards without matches have the names and the manifest of versions that could not store matches."""
+    table = pd.concat([facing(POSTER, 3, 1.5), facing(PLAIN, 1, 1.1)], ignore_index=True)
+    shards = tmp_path / "shards"
+    label(table, room, shards, shard_size=4)
+    (without,) = times(shards)
+    settings = json.loads((shards / MANIFEST).read_text())
+    assert settings["shards"] == {without.name: 4} and "store_matches" not in settings
+    label(table, room, shards, shard_size=4, store_matches=True)
+    both = times(shards)
+    (stored,) = both.keys() - {without}
+    expected = {**settings, "store_matches": True, "shards": {stored.name: 4}}
+    assert json.loads((shards / MANIFEST).read_text()) == expected
+    label(table, room, shards, shard_size=4)
+    assert times(shards) == both
+
+
+def test_pixels_are_kept_in_the_order_of_the_landmarks(room, views, matched, tmp_path):
+    """Inliers of a good view are within RANSAC's limit of their projection at the true pose."""
+    landmarks = Landmarks.load(room.landmarks)
+    rows = np.flatnonzero(is_good(matched))[:4]
+    localizer = Localizer(landmarks, CAMERA)
+    renderer = WarpRenderer(load_mesh(room.mesh))
+    some = views.iloc[rows].reset_index(drop=True)
+    kept = label_rows(some, replace(room.job, store_pixels=True), localizer, renderer)
+    write_table(kept, tmp_path / "viewpoints.parquet")
+    back = read_table(tmp_path / "viewpoints.parquet", pixels=True)
+    assert "matched_pixels" not in read_table(tmp_path / "viewpoints.parquet", matches=True)
+    for row, pose in enumerate(poses(some)):
+        np.testing.assert_array_equal(back["matched_rows"][row], matched["matched_rows"][rows[row]])
+        pixels = back["matched_pixels"][row].reshape(-1, 2)
+        assert pixels.dtype == np.float32 and len(pixels) == len(back["matched_rows"][row])
+        inlier = np.isin(back["matched_rows"][row], back["inlier_rows"][row])
+        at = CAMERA.project(transform(pose, landmarks.points[back["matched_rows"][row][inlier]]))
+        assert np.linalg.norm(at - pixels[inlier], axis=1).max() < 10
+    with pytest.raises(TableError):
+        write_table(matched, tmp_path / "matches.parquet")
+        read_table(tmp_path / "matches.parquet", pixels=True)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from selection.room import POINTS, WEIGHTS, write_room
 from wheretolook import LocalizationMap, load_scorer
@@ -57,7 +58,7 @@ def test_of_a_known_pose_the_view_with_the_best_score_is_next(scorer, selector):
     turn = np.degrees(np.arctan2(axis[1], axis[0]) - np.arctan2(FIRST[2, 1], FIRST[2, 0]))
     assert (turn - chosen.pan_deg + 180) % 360 - 180 == pytest.approx(0, abs=0.02)
     rolled = chosen.cam_from_rig @ FIRST[:, :3]
-    np.testing.assert_allclose(rolled, rotation_looking_along(axis), atol=1e-3)
+    assert_allclose(rolled, rotation_looking_along(axis), atol=1e-3)
 
 
 def test_the_gain_is_a_sum_over_hypotheses(scorer, selector):
@@ -72,10 +73,10 @@ def test_the_gain_is_a_sum_over_hypotheses(scorer, selector):
     ]
     lost = selector.scores_if_lost(both, axes, np.zeros(20))
     expected = found @ scores + (1 - found.sum()) * lost
-    np.testing.assert_allclose(selector.gains(both, axes, np.zeros(20)), expected, atol=1e-6)
+    assert_allclose(selector.gains(both, axes, np.zeros(20)), expected, atol=1e-6)
     ahead = np.array([(0, 0, 1.0), (np.sin(0.5), 0, np.cos(0.5)), (1.0, 0, 0), (0, 0, -1.0)])
     lost = selector.scores_if_lost(both, ahead, np.zeros(4))
-    np.testing.assert_allclose(lost / lost[3], [0, np.degrees(0.5) / 90, 1, 1], atol=1e-9)
+    assert_allclose(lost / lost[3], [0, np.degrees(0.5) / 90, 1, 1], atol=1e-9)
 
 
 def test_without_a_pose_a_level_camera_turns_within_limits(scorer, selector):

@@ -6,11 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from scipy.ndimage import gaussian_filter
 
-from wheretolook.geometry.mesh import TexturedMesh
-
-ROOM_SIZE = (5.0, 4.0, 2.6)
+from box_scenes import ROOM_SIZE, box_room
 
 
 @dataclass(frozen=True)
@@ -38,44 +35,6 @@ class BoxFreeSpace:
         points = np.asarray(points)
         inside = ((points[:, :2] >= 0) & (points[:, :2] <= np.array(self.size)[:2]) & (points[:, 2:] >= 0)).all(1)
         return np.where(inside, 0.0, np.nan)
-
-
-def noise_texture(rng, size=512):
-    """Coloured blobs of several sizes, periodic."""
-    image = np.zeros((size, size, 3))
-    for sigma in (2, 4, 8, 16):
-        layer = gaussian_filter(rng.normal(size=(size, size, 3)), (sigma, sigma, 0), mode="wrap")
-        image += layer / layer.std()
-    return np.clip(128 + 35 * image, 0, 255).astype(np.uint8)
-
-
-def box_room(size=ROOM_SIZE, seed=0):
-    """The inside of a box with a corner at the origin, each face with a texture of its own, 2.5 m across."""
-    size_m = np.array(size)
-    vertices = []
-    triangles = []
-    uvs = []
-    textures = []
-    rng = np.random.default_rng(seed)
-    for axis in range(3):
-        u, v = np.delete(np.arange(3), axis)
-        for side in (0.0, 1.0):
-            corners = np.zeros((4, 3))
-            corners[:, axis] = side * size_m[axis]
-            corners[:, u] = np.array([0, 1, 1, 0]) * size_m[u]
-            corners[:, v] = np.array([0, 0, 1, 1]) * size_m[v]
-            order = np.array([[0, 1, 2], [0, 2, 3]])
-            uvs.append((corners[:, [u, v]] / 2.5)[order])
-            triangles.append(order + 4 * len(vertices))
-            vertices.append(corners)
-            textures.append(noise_texture(rng))
-    return TexturedMesh(
-        vertices=np.concatenate(vertices).astype(np.float32),
-        triangles=np.concatenate(triangles).astype(np.int32),
-        corner_uvs=np.concatenate(uvs).astype(np.float32),
-        triangle_texture=np.repeat(np.arange(6), 2).astype(np.int32),
-        textures=tuple(textures),
-    )
 
 
 @pytest.fixture(scope="session")

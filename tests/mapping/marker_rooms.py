@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from mapping.conftest import box_room
+from box_scenes import box_room
 from wheretolook.geometry.camera import PinholeCamera
-from wheretolook.geometry.mesh import TexturedMesh
 from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.rendering.warp_renderer import WarpRenderer
 
@@ -41,29 +41,14 @@ MARKERS = (WallMarker(3, (1.6, 3.99, 1.5)), WallMarker(7, (2.6, 3.99, 1.0)), Wal
 
 def marker_room(markers=MARKERS, dictionary=DICTIONARY):
     """`box_room` with markers, each on a white square. No texture repeats: a mapping would take places for one."""
-    room = box_room()
-    vertices = [room.vertices]
-    uvs = [room.corner_uvs / 2]
-    textures = list(room.textures)
+    quads = []
+    textures = []
+    kind = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, dictionary))
     for marker in markers:
-        center = np.array(marker.center)
-        vertices.append((center + (marker.corners - center) * (1 + 2 * _MARGIN / _BLACK)).astype(np.float32))
-        corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], dtype=np.float32)
-        uvs.append(corners[[[0, 3, 2], [0, 2, 1]]])  # the front faces the room
-        kind = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, dictionary))
+        quads.append(marker.center + (marker.corners - marker.center)[::-1] * (1 + 2 * _MARGIN / _BLACK))
         black = cv2.aruco.generateImageMarker(kind, marker.marker_id, _BLACK)
         textures.append(np.repeat(np.pad(black, _MARGIN, constant_values=255)[..., None], 3, axis=2))
-    first = len(room.vertices) + 4 * np.arange(len(markers))[:, None, None]
-    added = (first + np.array([[0, 3, 2], [0, 2, 1]])).reshape(-1, 3)
-    return TexturedMesh(
-        np.concatenate(vertices),
-        np.concatenate([room.triangles, added]).astype(np.int32),
-        np.concatenate(uvs),
-        np.concatenate([room.triangle_texture, np.repeat(len(room.textures) + np.arange(len(markers)), 2)]).astype(
-            np.int32
-        ),
-        tuple(textures),
-    )
+    return box_room(texture_m=5.0, more_quads=quads, more_textures=textures)
 
 
 def hand_held_poses(n=14, seed=0):
@@ -75,13 +60,12 @@ def hand_held_poses(n=14, seed=0):
     pitch = np.radians(rng.uniform(-8, 8, n))
     axes = np.stack([np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), np.sin(pitch)], axis=1)
     poses = poses_looking_along(positions, axes)
-    roll = np.radians(rng.normal(scale=1.0, size=n))
-    turn = np.zeros((n, 3, 3))
-    turn[:, 0, 0] = turn[:, 1, 1] = np.cos(roll)
-    turn[:, 0, 1] = -np.sin(roll)
-    turn[:, 1, 0] = np.sin(roll)
-    turn[:, 2, 2] = 1
-    return turn @ poses
+    return rolled(poses, rng.normal(scale=1.0, size=n))
+
+
+def rolled(poses, roll_deg):
+    """Turn cameras about their optical axes."""
+    return Rotation.from_euler("z", np.asarray(roll_deg)[:, None], degrees=True).as_matrix() @ poses
 
 
 def take_photographs(mesh, poses, folder, camera=CAMERA):

@@ -2,23 +2,32 @@
 
 from pathlib import Path
 
+import cv2
 import numpy as np
+import pycolmap
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
+from mapping.marker_rooms import CAMERA, MARKERS, hand_held_poses, marker_room
 from wheretolook.commands.map import BuildMap
 from wheretolook.geometry.camera import CameraConfig
+from wheretolook.geometry.poses import transform
 from wheretolook.mapping.config import FrameOptions, ImportConfig, MapConfig, MarkerConfig, PhotographsConfig
 from wheretolook.mapping.georeference import (
     MapScale,
     Marker,
+    MarkerView,
+    detect_markers,
     fit_similarity,
+    place_marker,
     read_marker_table,
     read_positions,
     scale_from_distance,
     scale_from_markers,
     scale_from_positions,
 )
+from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.utils.errors import ConfigError, MapError
 
 SQUARE = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], dtype=np.float64)
@@ -38,8 +47,8 @@ def test_similarity_is_recovered_and_never_mirrors():
     rotation = Rotation.random(random_state=1).as_matrix()
     similarity = fit_similarity(points, 3.7 * points @ rotation.T + (1, -2, 5))
     assert similarity.scale == pytest.approx(3.7)
-    np.testing.assert_allclose(similarity.rotation, rotation, atol=1e-12)
-    np.testing.assert_allclose(similarity.translation, (1, -2, 5), atol=1e-12)
+    assert_allclose(similarity.rotation, rotation, atol=1e-12)
+    assert_allclose(similarity.translation, (1, -2, 5), atol=1e-12)
     assert np.linalg.det(fit_similarity(points, points * (1, 1, -1)).rotation) == pytest.approx(1)
     line = np.arange(5.0)[:, None] * (1, 2, 3)
     for few in (np.eye(3)[:2], line):
@@ -78,7 +87,7 @@ def test_positions_determine_the_frame_and_leave_residuals():
     scale, similarity = scale_from_positions(centers, {**positions, "lost.jpg": np.zeros(3)})
     assert scale.factor == pytest.approx(2) and scale.unit == "m" and list(scale.unused) == ["lost.jpg"]
     assert max(scale.residuals.values()) < 1e-12 and set(scale.residuals) == set(centers)
-    np.testing.assert_allclose(similarity.apply(centers["3.jpg"]), positions["3.jpg"])
+    assert_allclose(similarity.apply(centers["3.jpg"]), positions["3.jpg"])
     positions["2.jpg"] = positions["2.jpg"] + (0, 0, 0.3)
     worst = scale_from_positions(centers, positions)[0].residuals
     assert max(worst, key=lambda name: worst[name]) == "2.jpg"
@@ -102,7 +111,7 @@ def test_tables_of_markers_and_positions_are_read(tmp_path):
     assert read_marker_table(table) == {3: 0.4, 7: 0.2}
     for name, text in (("p.csv", "image,x,y,z\na.jpg,1,2,3\n"), ("p.json", '{"a.jpg": [1, 2, 3]}')):
         (tmp_path / name).write_text(text)
-        np.testing.assert_array_equal(read_positions(tmp_path / name)["a.jpg"], (1, 2, 3))
+        assert_array_equal(read_positions(tmp_path / name)["a.jpg"], (1, 2, 3))
 
 
 @pytest.mark.parametrize(
@@ -152,8 +161,7 @@ def test_options_of_renders_are_rejected_by_name_for_other_maps(source):
             BuildMap(**source, mapping=MapConfig(**{name: value}))
 
 
-def test_a_mislabelled_position_of_many_is_left_out(caplog):
-    rng = np.random.default_rng(0)
+def test_a_mislabelled_position_of_many_is_left_out(rng, caplog):
     centers = {f"{n:02}.jpg": rng.normal(0, 2, 3) for n in range(30)}
     positions = {name: 3 * center + (1, 2, 3) for name, center in centers.items()}
     positions["07.jpg"] = positions["07.jpg"] + (9, -7, 0)
@@ -166,3 +174,68 @@ def test_a_mislabelled_position_of_many_is_left_out(caplog):
         scale_from_positions(centers, positions)
     with pytest.raises(MapError, match=r"x.png; images are named like 00.jpg"):
         scale_from_positions(centers, {"x.png": np.zeros(3)})
+
+
+# Markers in images and in the map.
+
+COLMAP_CAMERA = pycolmap.Camera(
+    model="SIMPLE_RADIAL",
+    width=CAMERA.width,
+    height=CAMERA.height,
+    params=[CAMERA.focal_px, CAMERA.cx, CAMERA.cy, 0.05],
+)
+MARKER = MARKERS[1]
+
+
+def view(name, pose, noise_px=0.0):
+    """What a camera sees of `MARKER`, by COLMAP's own projection."""
+    pixels = np.asarray(COLMAP_CAMERA.img_from_cam(transform(pose, MARKER.corners)))
+    noise = np.random.default_rng(len(name)).normal(scale=noise_px, size=(4, 2)) if noise_px else 0.0
+    return MarkerView(name, COLMAP_CAMERA, pose, pixels + noise)
+
+
+@pytest.mark.parametrize("dictionary", ["DICT_4X4_50", "DICT_APRILTAG_36H11"])
+def test_rendered_corners_are_found_to_a_tenth_of_a_pixel(dictionary):
+    pose = hand_held_poses()[[7, 8]]
+    for rgb, at in zip(WarpRenderer(marker_room(dictionary=dictionary)).render(CAMERA, pose).rgb, pose, strict=True):
+        found = detect_markers(rgb, dictionary)
+        assert set(found) == {3, 7, 11}
+        for marker in MARKERS:
+            expected = CAMERA.project(transform(at, marker.corners))
+            assert np.linalg.norm(found[marker.marker_id] - expected, axis=1).max() < 0.1
+
+
+def test_corners_meet_where_they_are():
+    views = [view(f"{index}.jpg", pose) for index, pose in enumerate(hand_held_poses()[4:9])]
+    marker = place_marker(7, views)
+    assert_allclose(marker.corners, MARKER.corners, atol=1e-6)
+    assert_allclose(marker.sides, MARKER.size_m, atol=1e-6)
+    assert_allclose(marker.center, MARKER.center, atol=1e-6)
+    assert marker.images == tuple(f"{index}.jpg" for index in range(5)) and marker.error_px < 1e-4
+
+
+def test_one_bad_view_moves_little():
+    views = [view(f"{index}.jpg", pose) for index, pose in enumerate(hand_held_poses()[3:11])]
+    off = MarkerView("off.jpg", COLMAP_CAMERA, views[2].cam_from_world, views[2].corners_px + np.array([8.0, 0.0]))
+    marker = place_marker(7, [*views, off])
+    assert_allclose(marker.corners, MARKER.corners, atol=0.01)
+
+
+def test_a_marker_in_two_places_is_refused():
+    """One id printed twice, 0.4 m apart, seen in three photographs."""
+    views = [view(f"{index}.jpg", pose) for index, pose in enumerate(hand_held_poses()[[4, 6, 8]])]
+    elsewhere = MARKER.corners + np.array([0.4, 0.0, 0.0])
+    pixels = np.asarray(COLMAP_CAMERA.img_from_cam(transform(views[1].cam_from_world, elsewhere)))
+    moved = MarkerView("1.jpg", COLMAP_CAMERA, views[1].cam_from_world, pixels)
+    assert place_marker(7, views).error_px < 1e-4
+    with pytest.raises(MapError):
+        place_marker(7, [views[0], moved, views[2]])
+
+
+def test_the_same_marker_twice_in_an_image_is_refused():
+    kind = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
+    one = np.pad(cv2.aruco.generateImageMarker(kind, 5, 90), 30, constant_values=255)
+    rgb = np.repeat(np.hstack([one, one])[..., None], 3, axis=2)
+    with pytest.raises(MapError):
+        detect_markers(rgb, "DICT_4X4_50")
+    assert set(detect_markers(rgb[:, :150], "DICT_4X4_50")) == {5}

@@ -2,10 +2,12 @@
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
+from mapping.marker_rooms import rolled
 from wheretolook.geometry.poses import poses_looking_along
-from wheretolook.mapping.gravity import estimate_gravity, rotation_to_z
+from wheretolook.mapping.gravity import estimate_gravity
 
 TURN = Rotation.from_euler("xyz", [40, -65, 110], degrees=True).as_matrix()
 """From the world to the arbitrary frame of a mapping."""
@@ -16,8 +18,7 @@ def looking(yaw_deg, pitch_deg, roll_deg):
     pitch = np.radians(pitch_deg)
     axes = np.stack([np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), np.sin(pitch)], axis=1)
     poses = poses_looking_along(np.zeros((len(yaw), 3)), axes)
-    roll = Rotation.from_euler("z", np.asarray(roll_deg)[:, None], degrees=True).as_matrix()
-    poses[:, :, :3] = roll @ poses[:, :, :3] @ TURN.T
+    poses[:, :, :3] = rolled(poses, roll_deg)[:, :, :3] @ TURN.T
     return poses
 
 
@@ -30,12 +31,11 @@ def test_level_cameras_give_up_exactly_whatever_their_pitch():
     gravity = estimate_gravity(looking(yaw, np.full(9, -35.0), np.zeros(9)))
     assert gravity.method == "level"
     assert off_deg(gravity.up) < 1e-4
-    np.testing.assert_allclose(gravity.residual_deg, 0, atol=1e-4)
-    np.testing.assert_allclose(gravity.rotation @ gravity.up, (0, 0, 1), atol=1e-12)
+    assert_allclose(gravity.residual_deg, 0, atol=1e-4)
+    assert_allclose(gravity.rotation @ gravity.up, (0, 0, 1), atol=1e-12)
 
 
-def test_rolled_photographs_do_not_move_it():
-    rng = np.random.default_rng(0)
+def test_rolled_photographs_do_not_move_it(rng):
     yaw = rng.uniform(0, 360, 20)
     roll = rng.normal(scale=1.0, size=20)
     roll[:5] = 90.0  # held upright, without saying so
@@ -56,13 +56,3 @@ def test_up_can_be_given_in_the_camera():
     gravity = estimate_gravity(down, up_in_camera=(0.0, 0.0, -2.0))
     assert gravity.method == "given"
     assert off_deg(gravity.up) < 0.2
-
-
-def test_rotation_to_z_is_the_least():
-    for direction in np.random.default_rng(1).normal(size=(20, 3)):
-        rotation = rotation_to_z(direction)
-        np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
-        np.testing.assert_allclose(rotation @ direction, (0, 0, np.linalg.norm(direction)), atol=1e-12)
-        angle = np.arccos(direction[2] / np.linalg.norm(direction))
-        assert np.trace(rotation) == pytest.approx(1 + 2 * np.cos(angle))
-    np.testing.assert_allclose(rotation_to_z((0, 0, -3)) @ (0, 0, -3), (0, 0, 3))

@@ -5,7 +5,9 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
+from colmap_models import camera, model_of
 from wheretolook.features.extractor import quantize_descriptors, unit_descriptors
 from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.mapping.landmarks import Landmarks, load_colmap_landmarks, max_cosine_to_other
@@ -26,31 +28,17 @@ def project(point, image):
 
 
 def hand_written_model(offsets_px=OFFSETS_PX, tracks=TRACKS, points=POINTS):
-    """The model, with ids 10, 20, ... for the points, and the keypoints of its images, one unused at the front."""
-    model = pycolmap.Reconstruction()
-    for camera_id, focal_px in FOCAL_PX.items():
-        camera = pycolmap.Camera(
-            camera_id=camera_id, model="SIMPLE_PINHOLE", width=640, height=480, params=[focal_px, 320, 240]
-        )
-        model.add_camera_with_trivial_rig(camera)
+    """The model, and the keypoints of its images, one unused at the front."""
     keypoints = [[np.array([1.0 + i, 2.0])] for i in range(3)]
-    elements = []
-    for point, track, offset in zip(points, tracks, offsets_px, strict=True):
+    seen = [[] for _ in points]
+    for row, (point, track, offset) in enumerate(zip(points, tracks, offsets_px, strict=True)):
         for image in track:
-            elements.append((image + 1, len(keypoints[image])))
+            seen[row].append((image, len(keypoints[image])))
             keypoints[image].append(project(point, image) + np.array([offset, 0]))
+    cameras = [camera(number, "SIMPLE_PINHOLE", 640, 480, focal_px, 320, 240) for number, focal_px in FOCAL_PX.items()]
     poses = poses_looking_along(CENTERS, np.tile([0.0, 1.0, 0.0], (3, 1)))
-    for i, pose in enumerate(poses):
-        image = pycolmap.Image(name=f"{i}.png", camera_id=CAMERA_OF[i], image_id=i + 1)
-        image.points2D = pycolmap.Point2DList([pycolmap.Point2D(p) for p in keypoints[i]])
-        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pycolmap.Rotation3d(pose[:, :3]), pose[:, 3]))
-    used = 0
-    for index, (point, track) in enumerate(zip(points, tracks, strict=True)):
-        colmap_track = pycolmap.Track()
-        for image_id, keypoint in elements[used : used + len(track)]:
-            colmap_track.add_element(image_id, keypoint)
-        used += len(track)
-        model.add_point3D_with_id(10 * (index + 1), pycolmap.Point3D(xyz=point, track=colmap_track))
+    images = [(f"{i}.png", CAMERA_OF[i], pose, np.array(keypoints[i])) for i, pose in enumerate(poses)]
+    model = model_of(cameras, images, zip(points, seen, strict=True), id_step=10)
     return model, [np.array(k, dtype=np.float32) for k in keypoints]
 
 
@@ -88,22 +76,14 @@ def test_attributes_of_a_hand_written_model(tmp_path, text):
     with pytest.warns(MapWarning, match="3 of 4 points"):
         landmarks = load_colmap_landmarks(tmp_path, max_reprojection_error_px=0.5)
     # Point 30 is 2 px off in every image and so beyond 0.5 px.
-    np.testing.assert_array_equal(landmarks.ids, [10, 20, 40])
-    np.testing.assert_allclose(landmarks.points, POINTS[[0, 1, 3]], atol=1e-12)
-    np.testing.assert_array_equal(landmarks.track_length, [3, 2, 2])
-    np.testing.assert_allclose(landmarks.reprojection_error_px, [0, 0.3, 0], atol=1e-4)
+    assert_array_equal(landmarks.ids, [10, 20, 40])
+    assert_allclose(landmarks.points, POINTS[[0, 1, 3]], atol=1e-12)
+    assert_array_equal(landmarks.track_length, [3, 2, 2])
+    assert_allclose(landmarks.reprojection_error_px, [0, 0.3, 0], atol=1e-4)
     # Point 10 is 2 m ahead of the middle camera, the outer ones stand 2 m to its sides: 45 degrees each way.
     # Point 20 from (0, 0, 1) is (1, 4, 1) and from (2, 0, 1) is (-1, 4, 1): cos = 16 / 18.
-    # Point 40 from (-2, 0, 1) is (0, 5, 0) and from (2, 0, 1) is (-4, 5, 0): tan = 4 / 5.
     angles = [90, np.degrees(np.arccos(16 / 18)), np.degrees(np.arctan(4 / 5))]
-    np.testing.assert_allclose(landmarks.triangulation_angle_deg, angles, rtol=1e-5)
-    mean_y = [(1 + 2 * np.sqrt(0.5)) / 3]  # the x parts of point 10's rays cancel
-    np.testing.assert_allclose(landmarks.mapping_direction[0], [0, 1, 0], atol=1e-6)
-    np.testing.assert_allclose(landmarks.mapping_direction[1], np.array([0, 4, 1]) / np.sqrt(17), atol=1e-6)
-    np.testing.assert_allclose(landmarks.mapping_direction_spread[0], 1 - mean_y[0], atol=1e-6)
-    np.testing.assert_allclose(landmarks.mapping_direction_spread[1], 1 - np.sqrt(17 / 18), atol=1e-6)
-    np.testing.assert_allclose(landmarks.mapping_distance_m[0], (2 + 2 * np.sqrt(8)) / 3, rtol=1e-6)
-    np.testing.assert_allclose(landmarks.mapping_distance_m[1:], [np.sqrt(18), (5 + np.sqrt(41)) / 2], rtol=1e-6)
+    assert_allclose(landmarks.triangulation_angle_deg, angles, rtol=1e-5)
     assert landmarks.descriptors is None and np.isnan(landmarks.ambiguity).all()
     kinds = [landmarks.ids, landmarks.points, landmarks.track_length, landmarks.mapping_direction]
     assert [k.dtype for k in kinds] == [np.int64, np.float64, np.int32, np.float32]
@@ -115,17 +95,17 @@ def test_descriptors_are_means_over_the_track(tmp_path, model_dir):
     database = write_database(tmp_path / "database.db", model, keypoints, descriptors)
     landmarks = load_colmap_landmarks(model_dir, database, max_reprojection_error_px=0.5)
     # Keypoints in the order in which the points were added, after an unused one.
-    seen = {10: [(0, 1), (1, 1), (2, 1)], 20: [(1, 2), (2, 2)], 40: [(0, 3), (2, 4)]}
+    seen = [[(0, 1), (1, 1), (2, 1)], [(1, 2), (2, 2)], [(0, 3), (2, 4)]]
     expected = []
-    for track in seen.values():
+    for track in seen:
         unit = [d / np.linalg.norm(d) for d in (descriptors[i][k].astype(np.float64) for i, k in track)]
         mean = np.mean(unit, axis=0)
         expected.append(np.minimum(np.rint(512 * mean / np.linalg.norm(mean)), 255))
-    np.testing.assert_array_equal(landmarks.descriptors, np.array(expected))
+    assert_array_equal(landmarks.descriptors, np.array(expected))
     assert landmarks.descriptors.dtype == np.uint8
     unit = np.array(expected) / np.linalg.norm(expected, axis=1, keepdims=True)
     cosine = unit @ unit.T - 2 * np.eye(3)
-    np.testing.assert_allclose(landmarks.ambiguity, cosine.max(1), atol=1e-6)
+    assert_allclose(landmarks.ambiguity, cosine.max(1), atol=1e-6)
 
 
 @pytest.mark.parametrize("n", [2, 500, 3001])
@@ -137,7 +117,7 @@ def test_ambiguity_against_brute_force(n):
     cosine = unit[rows] @ unit.T
     cosine[np.arange(len(rows)), rows] = -1
     ambiguity = max_cosine_to_other(descriptors)
-    np.testing.assert_allclose(ambiguity[rows], cosine.max(1), atol=1e-6)
+    assert_allclose(ambiguity[rows], cosine.max(1), atol=1e-6)
     assert ambiguity[0] == ambiguity[-1] == pytest.approx(1, abs=1e-6)
 
 
@@ -149,20 +129,10 @@ def test_long_and_short_tracks_against_a_plain_loop(tmp_path):
     centers = rng.uniform(-3, 3, (n_images, 3))
     points = rng.uniform(-3, 3, (n_points, 3)) + np.array([0, 12, 0])
     tracks = [rng.choice(n_images, rng.integers(2, n_images), replace=False) for _ in range(n_points)]
-    model = pycolmap.Reconstruction()
-    model.add_camera_with_trivial_rig(
-        pycolmap.Camera(camera_id=1, model="PINHOLE", width=640, height=480, params=[300, 300, 320, 240])
-    )
     poses = poses_looking_along(centers, np.tile([0.0, 1.0, 0.0], (n_images, 1)))
-    for i, pose in enumerate(poses):
-        image = pycolmap.Image(name=f"{i}", camera_id=1, image_id=i + 1)
-        image.points2D = pycolmap.Point2DList([pycolmap.Point2D([0.0, 0.0]) for _ in range(n_points)])
-        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pycolmap.Rotation3d(pose[:, :3]), pose[:, 3]))
-    for p, (point, track) in enumerate(zip(points, tracks, strict=True)):
-        elements = pycolmap.Track()
-        for i in track:
-            elements.add_element(int(i) + 1, p)
-        model.add_point3D_with_id(p + 1, pycolmap.Point3D(xyz=point, track=elements, error=0.1))
+    images = [(f"{i}", 1, pose, np.zeros((n_points, 2))) for i, pose in enumerate(poses)]
+    seen = [(point, [(i, p) for i in track]) for p, (point, track) in enumerate(zip(points, tracks, strict=True))]
+    model = model_of([camera(1, "PINHOLE", 640, 480, 300, 300, 320, 240)], images, seen, 0.1)
     model.write_binary(str(tmp_path))
     landmarks = load_colmap_landmarks(tmp_path)
     for p, track in enumerate(tracks):
@@ -176,7 +146,7 @@ def test_long_and_short_tracks_against_a_plain_loop(tmp_path):
         assert landmarks.mapping_distance_m[p] == pytest.approx(distances.mean(), rel=1e-5)
         assert landmarks.mapping_distance_spread[p] == pytest.approx(distances.std() / distances.mean(), abs=1e-6)
         assert landmarks.mapping_direction_spread[p] == pytest.approx(1 - np.linalg.norm(mean), abs=1e-6)
-        np.testing.assert_allclose(landmarks.mapping_direction[p], mean / np.linalg.norm(mean), atol=1e-6)
+        assert_allclose(landmarks.mapping_direction[p], mean / np.linalg.norm(mean), atol=1e-6)
 
 
 @pytest.mark.parametrize("with_descriptors", [False, True])
@@ -197,7 +167,7 @@ def test_saved_landmarks_load_again(tmp_path, model_dir, with_descriptors, compa
         if other is not None and name != "described_by":
             assert other.dtype == value.dtype
             rtol = 0 if not compact or value.dtype.kind == "i" else 1e-7 if name == "points" else 5e-4
-            np.testing.assert_allclose(other, value, rtol=rtol, atol=1e-7 if compact else 0)
+            assert_allclose(other, value, rtol=rtol, atol=1e-7 if compact else 0)
     again.save(tmp_path / "b.npz", compact=compact)
     assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
 

@@ -4,6 +4,7 @@ import warnings
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from mapping.test_landmarks import hand_written_model
 from mapping.test_own_models import written
@@ -69,10 +70,10 @@ def test_learned_descriptors_are_read_and_averaged(tmp_path, kind, source):
     landmarks = load_colmap_landmarks(folder, path)
     assert landmarks.features == kind.name and landmarks.descriptors.dtype == np.float16
     means = expected_means(model, landmarks, stored)
-    np.testing.assert_allclose(landmarks.descriptors, means, atol=2e-3)
+    assert_allclose(landmarks.descriptors, means, atol=2e-3)
     cosine = means @ means.T
     np.fill_diagonal(cosine, -1)
-    np.testing.assert_allclose(landmarks.ambiguity, cosine.max(1), atol=3e-3)
+    assert_allclose(landmarks.ambiguity, cosine.max(1), atol=3e-3)
     for compact in (False, True):
         landmarks.save(tmp_path / "landmarks.npz", compact)
         again = Landmarks.load(tmp_path / "landmarks.npz")
@@ -82,8 +83,8 @@ def test_learned_descriptors_are_read_and_averaged(tmp_path, kind, source):
         warnings.simplefilter("error")
         known, found = read_features(path, ["0.png"])
     assert known is kind
-    np.testing.assert_allclose(found[0][0], keypoints[0], atol=1e-4)
-    np.testing.assert_allclose(found[0][1], stored[0], atol=2e-3)
+    assert_allclose(found[0][0], keypoints[0], atol=1e-4)
+    assert_allclose(found[0][1], stored[0], atol=2e-3)
 
 
 def test_a_database_is_read_as_colmap_4_reads_it(tmp_path):
@@ -94,7 +95,7 @@ def test_a_database_is_read_as_colmap_4_reads_it(tmp_path):
     with pycolmap.Database.open(str(database_of(tmp_path / "a.db", model, keypoints, stored, kind))) as database:
         read = database.read_descriptors(1)
         assert read.type == pycolmap.FeatureExtractorType.ALIKED_N16ROT
-        np.testing.assert_array_equal(read.to_float().data, stored[0].astype(np.float32))
+        assert_array_equal(read.to_float().data, stored[0].astype(np.float32))
 
 
 def test_the_number_of_columns_decides_the_kind_where_nothing_states_it(tmp_path):
@@ -139,4 +140,4 @@ def test_pairs_of_images_are_matched_by_similarity(tmp_path):
     with WorkerPool(1) as processes:
         found = list(match_pairs(images, np.array([[0, 1], [1, 2]]), tmp_path, processes, False, kind))
     for matches in found:
-        np.testing.assert_array_equal(matches, np.column_stack([np.arange(40)] * 2))
+        assert_array_equal(matches, np.column_stack([np.arange(40)] * 2))

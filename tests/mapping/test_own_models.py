@@ -6,26 +6,22 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
+from colmap_models import camera
+from mapping.marker_rooms import hand_held_poses
 from mapping.test_landmarks import hand_written_model, random_descriptors, write_database
+from synthetic_dataset import CAMERA, make_mapping_poses, make_scene
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import camera_centers, poses_looking_along
 from wheretolook.inputs.localization_map import LocalizationMap
-from wheretolook.mapping.colmap_model import model_arrays, read_model
+from wheretolook.mapping.colmap_model import load_mapping_poses, model_arrays, read_model, save_mapping_poses
 from wheretolook.mapping.config import place_name
 from wheretolook.mapping.landmarks import load_colmap_landmarks
 from wheretolook.mapping.map_frame import scale_warning, up_axis_warning
 from wheretolook.utils.errors import MapError, MapWarning
 
 pytestmark = pytest.mark.filterwarnings("error::wheretolook.utils.errors.MapWarning")
-
-
-def walk_in_a_room(n=40):
-    """Poses (n, 3, 4) of a camera that is carried along a room and turned, 1.5 m above the floor."""
-    along = np.linspace(0, 1, n)
-    heading = 6 * np.pi * along
-    centers = np.column_stack([5 * along, 1 + 0.3 * np.sin(heading), np.full(n, 1.5)])
-    return poses_looking_along(centers, np.column_stack([np.cos(heading), np.sin(heading), -0.1 * np.ones(n)]))
 
 
 def written(model, folder, text=False):
@@ -39,11 +35,8 @@ def rig_model():
     model = pycolmap.Reconstruction()
     rig = pycolmap.Rig(rig_id=1)
     for camera_id, width in ((1, 640), (2, 320)):
-        params = [width / 2, width / 2, 0.375 * width]
         model.add_camera(
-            pycolmap.Camera(
-                camera_id=camera_id, model="SIMPLE_PINHOLE", width=width, height=3 * width // 4, params=params
-            )
+            camera(camera_id, "SIMPLE_PINHOLE", width, 3 * width // 4, width / 2, width / 2, 0.375 * width)
         )
     sensors = [pycolmap.sensor_t(pycolmap.SensorType.CAMERA, camera_id) for camera_id in (1, 2)]
     rig.add_ref_sensor(sensors[0])
@@ -87,9 +80,9 @@ def test_a_rig_of_two_cameras_asks_which_one_looks(tmp_path, text):
     found = LocalizationMap.from_colmap(folder, camera=2, scale=1)
     assert found.camera == PinholeCamera(320, 240, 160.0) and len(found.landmarks) == 12
     centers = camera_centers(found.mapping_poses.astype(np.float64))
-    np.testing.assert_allclose(centers, [[0, 0, 1], [0.2, 0, 1], [1, 0, 1], [1.2, 0, 1]], atol=1e-6)
-    np.testing.assert_array_equal(found.landmarks.track_length, 4)
-    np.testing.assert_allclose(found.landmarks.reprojection_error_px, 0, atol=1e-3)
+    assert_allclose(centers, [[0, 0, 1], [0.2, 0, 1], [1, 0, 1], [1.2, 0, 1]], atol=1e-6)
+    assert_array_equal(found.landmarks.track_length, 4)
+    assert_allclose(found.landmarks.reprojection_error_px, 0, atol=1e-3)
 
 
 def test_arrays_are_what_pycolmap_says_of_each_point(tmp_path):
@@ -105,7 +98,7 @@ def test_arrays_are_what_pycolmap_says_of_each_point(tmp_path):
     for row, point_id in enumerate(arrays.point_ids):
         point = model.points3D[int(point_id)]
         span = slice(*arrays.observation_start[row : row + 2])
-        np.testing.assert_array_equal(arrays.points[row], point.xyz)
+        assert_array_equal(arrays.points[row], point.xyz)
         assert arrays.errors_px[row] == point.error
         elements = [(element.image_id, element.point2D_idx) for element in point.track.elements]
         images = arrays.image_ids[arrays.observation_image[span]]
@@ -156,7 +149,7 @@ def test_a_database_gives_ambiguity_and_is_not_written_to(tmp_path):
     db.close()
     before = database.read_bytes()
     found = LocalizationMap.from_colmap(folder, camera=1, database=database, scale=1)
-    np.testing.assert_array_equal(found.landmarks.ambiguity, expected)
+    assert_array_equal(found.landmarks.ambiguity, expected)
     assert database.read_bytes() == before and sorted(path.name for path in tmp_path.iterdir()) == ["db.db", "model"]
 
 
@@ -186,16 +179,16 @@ def test_features_in_hdf5_of_hloc(tmp_path):
             lengths = np.linalg.norm(descriptors[i].astype(np.float64), axis=1)
             group["descriptors"] = (descriptors[i] / lengths[:, None]).T
     found, expected = (load_colmap_landmarks(folder, path) for path in (tmp_path / "feats.h5", database))
-    np.testing.assert_allclose(found.ambiguity, expected.ambiguity, atol=0.01)
+    assert_allclose(found.ambiguity, expected.ambiguity, atol=0.01)
 
 
 def test_scale_and_axes_are_doubted_where_they_are_implausible():
-    poses = walk_in_a_room()
+    poses = hand_held_poses(40)
     centers = camera_centers(poses)
     for distance_m in (0.5, 2.5, 30.0):
         assert scale_warning(np.full(100, distance_m), centers) == ""
     assert scale_warning(np.full(100, 37 * 2.5), 37 * centers) and scale_warning(np.full(100, 2.5 / 37), centers / 37)
-    assert scale_warning(np.full(100, 20.0), 50 * centers)  # cameras 7.6 m apart
+    assert scale_warning(np.full(100, 20.0), 50 * centers)  # cameras metres apart
     assert scale_warning(np.full(100, 2.5), centers[:1]) == ""  # one camera has no distance from others
     assert up_axis_warning(poses) == ""
     for turn in ([[1, 0, 0], [0, 0, -1], [0, 1, 0]], np.diag([1, -1, -1])):
@@ -216,3 +209,39 @@ def test_scale_and_axes_are_doubted_where_they_are_implausible():
 )
 def test_places_are_named_by_the_folder_that_has_a_name(folder, name):
     assert place_name(Path(folder)) == name
+
+
+# Poses of mapping images: stored, read back, and read from the COLMAP model where there is no file of them.
+
+
+@pytest.fixture
+def scene(tmp_path):
+    """A scene without a COLMAP model, as of a release."""
+    return make_scene(tmp_path / "scene", "train", seed=0, n_locations=3, n_directions=4, n_landmarks=20)
+
+
+def test_poses_come_back_from_disk_and_give_the_same_bytes(tmp_path):
+    poses = make_mapping_poses(3)
+    path = tmp_path / "cameras.npz"
+    save_mapping_poses(poses, path)
+    np.testing.assert_array_equal(load_mapping_poses(path), poses.astype(np.float32))
+    content = path.read_bytes()
+    save_mapping_poses(load_mapping_poses(path), path)
+    assert path.read_bytes() == content and [file.name for file in tmp_path.iterdir()] == ["cameras.npz"]
+
+
+def test_poses_are_unknown_without_a_file(scene):
+    stored = scene.localization_map(CAMERA).mapping_poses
+    np.testing.assert_array_equal(stored, load_mapping_poses(scene.mapping_cameras))
+    scene.mapping_cameras.unlink()
+    assert scene.localization_map(CAMERA).mapping_poses is None
+
+
+def test_invalid_files_are_rejected(scene):
+    path = scene.mapping_cameras
+    path.write_bytes(path.read_bytes()[:-40])
+    with pytest.raises(MapError):
+        scene.localization_map(CAMERA)
+    path.unlink()
+    with pytest.raises(MapError):
+        load_mapping_poses(path)

@@ -8,12 +8,12 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
+from numpy.testing import assert_allclose
 
 from all_options import AllOptions, run
 from mapping.marker_rooms import CAMERA, MARKERS, hand_held_poses, marker_room, take_photographs
 from wheretolook.commands.label import Label
 from wheretolook.commands.map import BuildMap
-from wheretolook.commands.options import ScenesConfig
 from wheretolook.commands.sample import Sample
 from wheretolook.commands.viewpoint_map import BuildViewpointMap
 from wheretolook.dataset.sampling_config import SampleConfig
@@ -77,7 +77,7 @@ def test_photographs_are_placed_at_their_true_scale_and_upright(mapped, photogra
     assert similarity.scale == pytest.approx(1, abs=0.01)
     assert np.degrees(np.arccos(similarity.rotation[2, 2])) < 2  # z of the map against true z
     assert np.linalg.norm(similarity.apply(centers) - CENTERS, axis=1).max() < 0.02
-    np.testing.assert_allclose(centers.mean(0), 0, atol=1e-6)
+    assert_allclose(centers.mean(0), 0, atol=1e-6)
 
 
 def test_the_map_is_as_any_other(mapped):
@@ -117,7 +117,7 @@ def test_other_sources_of_scale_reuse_the_mapping(mapped, photographs, tmp_path)
     table.write_text("image,x,y,z\n" + rows)
     by_positions = scaled(positions=table)
     assert by_positions.scale.unit == "m" and max(by_positions.scale.residuals.values()) < 0.02
-    np.testing.assert_allclose(camera_centers(colmap_poses(tmp_path / "map")), CENTERS, atol=0.02)
+    assert_allclose(camera_centers(colmap_poses(tmp_path / "map")), CENTERS, atol=0.02)
     assert by_positions.gravity["method"] == "positions"
 
     unknown = scaled()
@@ -155,7 +155,7 @@ def experiment(mapped, photographs, tmp_path_factory):
         device="cpu",
         source={"photographs": config_of(photographs)},
         sample=SampleConfig(grid=(6, 4, 3), directions=60, keep=10),
-        scenes=ScenesConfig(mapped_space=MappedSpaceConfig(max_camera_distance_m=0.6)),
+        mapped_space=MappedSpaceConfig(max_camera_distance_m=0.6),
     )
     shutil.copytree(mapped[0] / "work", experiment.root / "room" / "photographs")
     said = []
@@ -184,7 +184,7 @@ def test_a_scene_of_photographs_is_sampled_and_scored_but_not_labelled(experimen
     assert to_cameras.max() <= 0.6
     localization_map = scene.localization_map(dataset.camera)
     shares = VisibleScorer(localization_map).score(views)
-    np.testing.assert_allclose(shares * len(localization_map.landmarks), table["n_visible"], atol=2)
+    assert_allclose(shares * len(localization_map.landmarks), table["n_visible"], atol=2)
     with pytest.raises(SceneError):
         run(Label, metric)
     said.clear()
@@ -192,7 +192,7 @@ def test_a_scene_of_photographs_is_sampled_and_scored_but_not_labelled(experimen
     (found,) = run(BuildViewpointMap, replace(metric, viewpoint_map=views_of_map), said.append).values()
     assert found.origin.occlusion == "hidden-points" and set(found.voxel_of_row) <= set(table["location_id"])
     best = found.best(camera_centers(views)[0])
-    assert best is not None and best.n_visible > 0
+    assert best.n_visible > 0
     run(BuildMap, metric, said.append)
     run(Sample, metric, said.append)
     assert sum("reusing" in line for line in said) == 2

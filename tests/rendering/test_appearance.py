@@ -4,6 +4,7 @@ from dataclasses import astuple, replace
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from wheretolook.geometry.camera import ColmapCamera, PinholeCamera
 from wheretolook.rendering.appearance import PERSON_M, READ_NOISE, Appearance
@@ -25,7 +26,7 @@ def in_light(image):
 def test_strength_0_is_the_identity():
     image = np.random.default_rng(1).integers(0, 256, (480, 640, 3)).astype(np.uint8)
     assert len(np.unique(image)) == 256
-    np.testing.assert_array_equal(NONE.apply(image, CAMERA), image)
+    assert_array_equal(NONE.apply(image, CAMERA), image)
 
 
 def test_exposure_multiplies_linear_light_and_saturates():
@@ -57,7 +58,7 @@ def test_blur_of_a_point_keeps_its_light_and_has_the_moments_of_a_line_and_a_gau
         at = np.indices(kernel.shape) - len(kernel) // 2
         variance = (at**2 * kernel).sum((1, 2))
         expected = np.square([down, right]) / 12 + deviation**2
-        np.testing.assert_allclose(variance, expected, rtol=0.06, atol=0.1)
+        assert_allclose(variance, expected, rtol=0.06, atol=0.1)
         light = in_light(blurred.apply(image, CAMERA))
         assert light[..., 1].sum() == pytest.approx(1, rel=0.03)
         assert light[[0, -1]].sum() == light[:, [0, -1]].sum() == 0
@@ -116,4 +117,4 @@ def test_a_views_appearance_follows_from_its_pose_and_the_seed():
     strengths = np.array([view.strength for view in views])
     assert strengths.max() <= 0.6 and strengths.mean() == pytest.approx(0.3, abs=0.03)
     doubled = [view.strength for view in Appearance.of_views(poses, 0.3, 3)]
-    np.testing.assert_allclose(doubled, strengths / 2)
+    assert_allclose(doubled, strengths / 2)

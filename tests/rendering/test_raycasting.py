@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose, assert_array_equal
 
 from box_scenes import CABINET, ROOM, furnished_room, random_triangles
 from twins.open3d_renderer import raycasting_scene
@@ -30,11 +31,11 @@ def test_cast_agrees_with_open3d(seed, device):
     hit &= np.isfinite(hits.distance_m)
     same = hits.triangle[hit] == expected["primitive_ids"].numpy()[hit]
     assert same.mean() > 0.999
-    np.testing.assert_allclose(hits.distance_m[hit][same], distance_m[hit][same], rtol=1e-4, atol=1e-5)
+    assert_allclose(hits.distance_m[hit][same], distance_m[hit][same], rtol=1e-4, atol=1e-5)
     normals = expected["primitive_normals"].numpy()[hit][same]
     facing = np.einsum("nd,nd->n", normals, unit[hit][same])
     clear = np.abs(facing) > 1e-3
-    np.testing.assert_array_equal(hits.front[hit][same][clear], facing[clear] < 0)
+    assert_array_equal(hits.front[hit][same][clear], facing[clear] < 0)
     assert (hits.triangle[~np.isfinite(hits.distance_m)] == -1).all()
 
 
@@ -42,8 +43,8 @@ def test_cast_in_a_box_in_closed_form():
     raycaster = MeshRaycaster(furnished_room())
     hits = raycaster.cast([(1, 1, 1)] * 3 + [(5, 1, 1)], [(-2, 0, 0), (1, 0, 0), (0, 0, 9), (0, 0, 1)])
     # To the wall x = 0, to the cabinet's side x = 4, to the ceiling, and from inside the cabinet to its top.
-    np.testing.assert_allclose(hits.distance_m, [1, 3, 2, 1], rtol=1e-6)
-    np.testing.assert_array_equal(hits.front, [True, True, True, False])
+    assert_allclose(hits.distance_m, [1, 3, 2, 1], rtol=1e-6)
+    assert_array_equal(hits.front, [True, True, True, False])
     outside = raycaster.cast([(-1, 1, 1)], [(-1, 0, 0)])
     assert np.isinf(outside.distance_m[0]) and outside.triangle[0] == -1 and not outside.front[0]
 
@@ -53,7 +54,7 @@ def test_occlusion_margin():
     # On the wall y = 5, a little behind it, well behind it, and behind the cabinet.
     points = [(3, 5, 1), (3, 5.01, 1), (3, 5.1, 1), (5, 0, 1)]
     origins = [(3, 3, 1), (4, 3, 1)]
-    np.testing.assert_array_equal(
+    assert_array_equal(
         raycaster.occluded(origins, points, margin_m=0.02), [[False, False, True, True], [False, False, True, True]]
     )
     assert not raycaster.occluded([(3, 3, 1)], [(3, 3, 1)]).any(), "a point at the origin is unoccluded"
@@ -66,14 +67,14 @@ def test_distance_to_surface(device):
     mesh = random_triangles(0)
     points = np.random.default_rng(0).uniform(-4, 4, (500, 3))
     expected = raycasting_scene(mesh).compute_distance(o3d.core.Tensor(points.astype(np.float32))).numpy()
-    np.testing.assert_allclose(MeshRaycaster(mesh, device).distance_to_surface(points, 100), expected, atol=1e-5)
+    assert_allclose(MeshRaycaster(mesh, device).distance_to_surface(points, 100), expected, atol=1e-5)
     near = MeshRaycaster(mesh, device).distance_to_surface(points, 0.3)
-    np.testing.assert_array_equal(np.isfinite(near), expected < 0.3)
+    assert_array_equal(np.isfinite(near), expected < 0.3)
 
     room = MeshRaycaster(furnished_room())
     left = CABINET[0][0]  # 0.3 m and 0.4 m from the cabinet's vertical edge
     back = CABINET[1][1]
-    np.testing.assert_allclose(room.distance_to_surface([(left - 0.3, back + 0.4, 1.2)], 9), 0.5, rtol=1e-5)
+    assert_allclose(room.distance_to_surface([(left - 0.3, back + 0.4, 1.2)], 9), 0.5, rtol=1e-5)
 
 
 def test_segments_keep_clear_as_densely_sampled_points_do(device):
@@ -86,7 +87,7 @@ def test_segments_keep_clear_as_densely_sampled_points_do(device):
     samples = (a * (1 - steps) + b * steps).reshape(-1, 3)
     nearest = MeshRaycaster(mesh).distance_to_surface(samples, 10).reshape(800, -1).min(axis=0)
     decided = np.abs(nearest - clearance_m) > 0.005
-    np.testing.assert_array_equal(clear[decided], nearest[decided] > clearance_m)
+    assert_array_equal(clear[decided], nearest[decided] > clearance_m)
     assert 0.1 < clear.mean() < 0.9
     middle = np.array(ROOM) / 2
     room = MeshRaycaster(furnished_room())

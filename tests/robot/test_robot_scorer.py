@@ -24,11 +24,11 @@ from wheretolook.geometry.poses import Float, invert_poses, poses_looking_along
 from wheretolook.inputs.channels import ATTRIBUTES
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.inputs.statistics import FeatureStatistics
-from wheretolook.mapping.landmarks import Landmarks
+from wheretolook.mapping.landmarks import MAP_ATTRIBUTES, Landmarks
 from wheretolook.mapping.map import Map
 from wheretolook.robot import wheretolook_robot
 from wheretolook.robot.export import export_robot, pinhole_of
-from wheretolook.robot.wheretolook_robot import RobotScorer
+from wheretolook.robot.wheretolook_robot import RobotScorer, description_digest, file_digest
 from wheretolook.scorers.set.network import SetNetwork
 from wheretolook.scorers.weights import load_scorer
 from wheretolook.space.free_space import FreeSpace
@@ -281,27 +281,21 @@ def content(name: str, change):
 
 
 DAMAGES = [
-    setting("camera", name, value=value)
-    for name, value in (("fx", 0), ("fy", np.nan), ("width", -1), ("cx", "a"), ("cx", np.nan), ("fx", 1e9))
+    setting("camera", "fx", value=0),
+    setting("world_from_map", "rotation", value=np.zeros((3, 3)).tolist()),
+    setting("map_attributes", value=[*MAP_ATTRIBUTES[::-1]]),
+    setting("range", "in_view", value=[np.nan, 2]),
+    *(setting(key, value=None) for key in ("camera", "files", "sha256", "format_version")),
+    array("points", lambda a: np.where(a == a[0, 0], np.nan, a)),
+    array("directions", lambda a: 1e4 * a),
+    array("attributes", lambda a: np.full_like(a, np.nan)),
+    array("unoccluded", lambda a: None),
+    *(content(name, lambda data: data[: len(data) // 2]) for name in ("robot.json", "landmarks.npz", "scorer.onnx")),
+    *(content(name, lambda data: b"") for name in ("robot.json", "landmarks.npz", "scorer.onnx")),
+    content("robot.json", lambda data: b"[" * 100_000),
+    content("robot.json", lambda data: b"\xff[]"),
+    content("robot.json", lambda data: data + b" " * 1_000_000),
 ]
-DAMAGES += [
-    setting(key, value=None) for key in ("camera", "attributes", "most", "range", "n_landmarks", "format_version")
-]
-DAMAGES += [setting("most", value=-1), setting("most", value=1e400), setting("n_landmarks", value=7)]
-DAMAGES += [setting("attributes", value=["across"]), setting("map_attributes", value=[]), setting("range", value=[1])]
-DAMAGES += [setting("range", "distance_m", value=[3, 2]), setting("range", "in_view", value=[np.nan, 2])]
-DAMAGES += [array("points", lambda a: np.where(a == a[0, 0], np.nan, a)), array("points", lambda a: a[:, :2])]
-DAMAGES += [
-    array("points", lambda a: None),
-    array("places", lambda a: a.reshape(-1)),
-    array("unoccluded", lambda a: a[:, :-1]),
-]
-DAMAGES += [array("attributes", lambda a: a.astype(str)), array("directions", lambda a: a.astype(object))]
-DAMAGES += [
-    content(name, lambda data: data[: len(data) // 2]) for name in ("robot.json", "landmarks.npz", "scorer.onnx")
-]
-DAMAGES += [content(name, lambda data: b"") for name in ("robot.json", "landmarks.npz", "scorer.onnx")]
-DAMAGES += [content("robot.json", lambda data: b"[" * 100_000), content("robot.json", lambda data: b"\xff[]")]
 
 
 @pytest.mark.parametrize("damage", DAMAGES)
@@ -317,6 +311,10 @@ def test_devices_and_bombs_are_rejected(folder: Path, tmp_path: Path, monkeypatc
     monkeypatch.setattr("wheretolook.robot.wheretolook_robot.FREE_BYTES", 1000)
     with np.load(copy / "landmarks.npz") as stored:
         np.savez_compressed(copy / "landmarks.npz", **{**stored, "places": np.zeros((200_000, 3))})
+    about = json.loads((copy / "robot.json").read_text())
+    about["files"]["landmarks.npz"] = file_digest(copy / "landmarks.npz")
+    del about["sha256"]
+    (copy / "robot.json").write_text(json.dumps(about | {"sha256": description_digest(about)}))
     with pytest.raises(ValueError, match="would expand"):
         RobotScorer(copy)
     for name in ("landmarks.npz", "robot.json"):

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import trimesh
+from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 from trimesh.visual import ColorVisuals, TextureVisuals
 from trimesh.visual.material import PBRMaterial
@@ -28,9 +29,9 @@ def textured(texture, vertices=VERTICES, **material):
 
 
 def assert_is_the_quad(mesh, texture, uvs=UVS_DOWN):
-    np.testing.assert_array_equal(mesh.vertices[mesh.triangles], VERTICES[FACES].astype(np.float32))
-    np.testing.assert_allclose(mesh.corner_uvs, uvs[FACES], atol=1e-7)
-    np.testing.assert_array_equal(mesh.textures[mesh.triangle_texture[0]], texture)
+    assert_array_equal(mesh.vertices[mesh.triangles], VERTICES[FACES].astype(np.float32))
+    assert_allclose(mesh.corner_uvs, uvs[FACES], atol=1e-7)
+    assert_array_equal(mesh.textures[mesh.triangle_texture[0]], texture)
     assert mesh.vertices.dtype == np.float32 and mesh.corner_uvs.dtype == np.float32
     assert mesh.triangles.dtype == np.int32 and mesh.triangle_texture.dtype == np.int32
 
@@ -52,7 +53,7 @@ def test_glb_with_a_node_transform_and_several_materials(tmp_path, texture):
     found = mesh.vertices[mesh.triangles].reshape(-1, 2, 3, 3)
     for vertices, image in expected:
         (part,) = [i for i, corners in enumerate(found) if np.allclose(corners, vertices[FACES], atol=1e-5)]
-        np.testing.assert_array_equal(mesh.textures[mesh.triangle_texture[2 * part]], image)
+        assert_array_equal(mesh.textures[mesh.triangle_texture[2 * part]], image)
 
 
 def test_a_mirroring_transform_keeps_fronts_in_front(tmp_path, texture):
@@ -60,8 +61,8 @@ def test_a_mirroring_transform_keeps_fronts_in_front(tmp_path, texture):
     scene.add_geometry(textured(texture), transform=np.diag([-1.0, 1, 1, 1]))
     scene.export(tmp_path / "a.glb")
     mesh = load_mesh(tmp_path / "a.glb")
-    np.testing.assert_allclose(mesh.vertices[mesh.triangles], (VERTICES * (-1, 1, 1))[FACES[:, ::-1]], atol=1e-6)
-    np.testing.assert_allclose(mesh.corner_uvs, UVS_DOWN[FACES[:, ::-1]], atol=1e-7)
+    assert_allclose(mesh.vertices[mesh.triangles], (VERTICES * (-1, 1, 1))[FACES[:, ::-1]], atol=1e-6)
+    assert_allclose(mesh.corner_uvs, UVS_DOWN[FACES[:, ::-1]], atol=1e-7)
 
 
 def test_glb_factors_and_vertex_colors(tmp_path, texture):
@@ -74,7 +75,7 @@ def test_glb_factors_and_vertex_colors(tmp_path, texture):
     plain.visual = TextureVisuals(material=PBRMaterial(baseColorFactor=[55, 0, 255, 255]))
     plain.export(tmp_path / "plain.glb")
     mesh = load_mesh(tmp_path / "plain.glb")
-    np.testing.assert_array_equal(mesh.textures[0], [[[128, 0, 255]]])
+    assert_array_equal(mesh.textures[0], [[[128, 0, 255]]])
 
     colored = textured(texture)
     colors = np.random.default_rng(2).integers(0, 256, (4, 4), dtype=np.uint8)
@@ -82,7 +83,7 @@ def test_glb_factors_and_vertex_colors(tmp_path, texture):
     colored.export(tmp_path / "colored.glb")
     mesh = load_mesh(tmp_path / "colored.glb")
     assert_is_the_quad(mesh, texture)
-    np.testing.assert_array_equal(mesh.vertex_colors, colors[:, :3])
+    assert_array_equal(mesh.vertex_colors, colors[:, :3])
 
 
 OBJ = """mtllib a.mtl
@@ -109,10 +110,10 @@ def test_obj_with_two_materials(tmp_path, texture):
     mesh = load_mesh(tmp_path / "a.obj")
     assert len(mesh.textures) == 2
     by_height = np.argsort(mesh.vertices[mesh.triangles][:, :, 2].max(axis=1))
-    np.testing.assert_array_equal(mesh.vertices[mesh.triangles[by_height]], VERTICES[FACES])
-    np.testing.assert_allclose(mesh.corner_uvs[by_height[0]], UVS_DOWN[FACES[0]], atol=1e-7)
-    np.testing.assert_array_equal(mesh.textures[mesh.triangle_texture[by_height[0]]], texture)
-    np.testing.assert_array_equal(mesh.textures[mesh.triangle_texture[by_height[1]]], [[[51, 102, 153]]])
+    assert_array_equal(mesh.vertices[mesh.triangles[by_height]], VERTICES[FACES])
+    assert_allclose(mesh.corner_uvs[by_height[0]], UVS_DOWN[FACES[0]], atol=1e-7)
+    assert_array_equal(mesh.textures[mesh.triangle_texture[by_height[0]]], texture)
+    assert_array_equal(mesh.textures[mesh.triangle_texture[by_height[1]]], [[[51, 102, 153]]])
 
     (tmp_path / "my texture.png").unlink()
     with pytest.raises(SceneError):
@@ -142,9 +143,9 @@ def test_ply_with_texture_coordinates_by_corner(tmp_path, texture):
     (tmp_path / "a.ply").write_text(content)
     Image.fromarray(texture).save(tmp_path / "t.png")
     mesh = load_mesh(tmp_path / "a.ply")
-    np.testing.assert_array_equal(mesh.vertices[mesh.triangles], VERTICES[FACES])
-    np.testing.assert_allclose(mesh.corner_uvs, uvs * (1, -1) + (0, 1), atol=1e-7)
-    np.testing.assert_array_equal(mesh.textures[0], texture)
+    assert_array_equal(mesh.vertices[mesh.triangles], VERTICES[FACES])
+    assert_allclose(mesh.corner_uvs, uvs * (1, -1) + (0, 1), atol=1e-7)
+    assert_array_equal(mesh.textures[0], texture)
     (tmp_path / "t.png").unlink()
     with pytest.raises(SceneError):
         load_mesh(tmp_path / "a.ply")
@@ -155,9 +156,9 @@ def test_ply_with_colors(tmp_path):
     colors = np.random.default_rng(0).integers(0, 256, (4, 3))
     (tmp_path / "v.ply").write_text(ply(rgb, [" ".join(map(str, color)) for color in colors]))
     mesh = load_mesh(tmp_path / "v.ply")
-    np.testing.assert_array_equal(mesh.vertices, VERTICES)
-    np.testing.assert_array_equal(mesh.vertex_colors, colors)
-    np.testing.assert_array_equal(mesh.textures[0], [[[255, 255, 255]]])
+    assert_array_equal(mesh.vertices, VERTICES)
+    assert_array_equal(mesh.vertex_colors, colors)
+    assert_array_equal(mesh.textures[0], [[[255, 255, 255]]])
 
     for values in ((), ("property float s\nproperty float t", ["0 0"] * 4)):  # neither colours nor an image
         (tmp_path / "plain.ply").write_text(ply(*values))
@@ -167,8 +168,8 @@ def test_ply_with_colors(tmp_path):
     faces.visual = ColorVisuals(faces, face_colors=np.array([[1, 2, 3, 255], [7, 8, 9, 255]], np.uint8))
     faces.export(tmp_path / "f.ply")
     mesh = load_mesh(tmp_path / "f.ply")
-    np.testing.assert_array_equal(mesh.vertices[mesh.triangles], VERTICES[FACES])
-    np.testing.assert_array_equal(mesh.vertex_colors[mesh.triangles], [[[1, 2, 3]] * 3, [[7, 8, 9]] * 3])
+    assert_array_equal(mesh.vertices[mesh.triangles], VERTICES[FACES])
+    assert_array_equal(mesh.vertex_colors[mesh.triangles], [[[1, 2, 3]] * 3, [[7, 8, 9]] * 3])
 
 
 @pytest.mark.parametrize(
@@ -178,7 +179,7 @@ def test_ply_with_colors(tmp_path):
 def test_up_axis_becomes_z_without_mirroring(tmp_path, texture, up, axis):
     textured(texture).export(tmp_path / "a.glb")
     mesh = load_mesh(tmp_path / "a.glb", up=up)
-    np.testing.assert_allclose(mesh.vertices[:, 2], VERTICES @ axis, atol=1e-6)
+    assert_allclose(mesh.vertices[:, 2], VERTICES @ axis, atol=1e-6)
     a, b, c = mesh.vertices[1:] - mesh.vertices[0]
     assert np.dot(np.cross(a, b), c) == pytest.approx(np.linalg.det(VERTICES[1:] - VERTICES[0]))
 
@@ -192,7 +193,7 @@ def test_degenerate_triangles_and_loose_vertices_are_dropped(tmp_path, texture):
     trimesh.Trimesh(vertices, faces, visual=visual, process=False).export(tmp_path / "a.glb")
     loaded = load_mesh(tmp_path / "a.glb")
     assert_is_the_quad(loaded, texture)
-    np.testing.assert_array_equal(loaded.bounds, [[0, 0, 0], [2, 3, 1]])
+    assert_array_equal(loaded.bounds, [[0, 0, 0], [2, 3, 1]])
 
 
 def test_invalid_arguments_are_rejected(tmp_path):
@@ -213,11 +214,11 @@ def test_saved_glb_loads_again(tmp_path, colored):
     save_glb(mesh, tmp_path / "a.glb", jpeg_quality=95)
     again = load_mesh(tmp_path / "a.glb")
     order = np.argsort(mesh.triangle_texture, kind="stable")  # written texture by texture
-    np.testing.assert_array_equal(again.vertices[again.triangles], mesh.vertices[mesh.triangles[order]])
-    np.testing.assert_allclose(again.corner_uvs, mesh.corner_uvs[order], atol=1e-6)
-    np.testing.assert_array_equal(again.triangle_texture, mesh.triangle_texture[order])
+    assert_array_equal(again.vertices[again.triangles], mesh.vertices[mesh.triangles[order]])
+    assert_allclose(again.corner_uvs, mesh.corner_uvs[order], atol=1e-6)
+    assert_array_equal(again.triangle_texture, mesh.triangle_texture[order])
     if colored:
-        np.testing.assert_array_equal(again.vertex_colors[again.triangles], mesh.vertex_colors[mesh.triangles[order]])
+        assert_array_equal(again.vertex_colors[again.triangles], mesh.vertex_colors[mesh.triangles[order]])
     for texture, saved in zip(mesh.textures, again.textures, strict=True):
         assert texture.shape == saved.shape
         assert np.abs(texture.astype(int) - saved).max() <= (2 if colored else 40)  # JPEG of white noise

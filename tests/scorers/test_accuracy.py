@@ -3,10 +3,8 @@
 import json
 import math
 import warnings
-from dataclasses import replace
 
 import numpy as np
-import pandas as pd
 import pycolmap
 import pytest
 from scipy.stats import lognorm
@@ -30,7 +28,6 @@ from wheretolook.select.where_to_look import WhereToLook
 from wheretolook.training.weights import read_header
 from wheretolook.utils.errors import ConfigError, MapWarning, OutOfRangeWarning, WeightsError
 from wheretolook.utils.package import WEIGHTS, shipped
-from wheretolook_paper.studies import fit_accuracy
 
 ACCURACIES = ((1e-9, 1e-9), (0.01, 0.1), ACCURACY, (0.1, 1.0), (0.25, 2.0), (math.inf, math.inf))
 DISTANCE_M = read_header(shipped(WEIGHTS) / "set.safetensors")["range"]["distance_m"]  # of the training views
@@ -99,26 +96,6 @@ def test_errors_and_limits_scale_with_the_unit():
     assert MODEL.expected_errors(statistics)[:, 0] == pytest.approx(lognorm(0.9, scale=median_m).mean())
 
 
-def test_the_fit_finds_the_model_that_errors_are_drawn_from(monkeypatch):
-    rng = np.random.default_rng(3)
-    statistics = views(20_000)
-    own = rng.uniform(0.01, 0.99, len(statistics))
-    place = rng.uniform(size=len(own)) < MODEL.p_right_place(own, statistics)
-    noise = rng.normal(size=(len(own), 1)) * [error.deviation for error in MODEL.errors]
-    # shrunk, so that no error at the right place exceeds its limits
-    errors = np.exp(MODEL.log_errors(statistics) + noise - 12)
-    errors[~place] = np.inf
-    table = pd.DataFrame(statistics, columns=VIEW_STATISTICS).assign(
-        own=own, scene="one", error_m=errors[:, 0], error_deg=errors[:, 1]
-    )
-    monkeypatch.setattr(fit_accuracy, "LEAST", (0.0, 0.0))
-    found = fit_accuracy.fit(table)
-    assert [*found.weights, found.bias] == pytest.approx([*MODEL.weights, MODEL.bias], abs=0.1)
-    for error, known in zip(found.errors, MODEL.errors, strict=True):
-        assert error.weights == pytest.approx(known.weights, abs=0.03)
-        assert (error.bias + 12, error.deviation) == pytest.approx((known.bias, known.deviation), abs=0.1)
-
-
 def test_the_bundled_file_is_the_model_and_damage_is_found(tmp_path):
     stored = json.loads(AccuracyModel.file.read_text())
     model = AccuracyModel.bundled()
@@ -165,7 +142,7 @@ def test_views_have_an_accuracy_and_expected_errors(scorer):
     own = look.best(place)
     coarse = look.best(place, accuracy=(0.25, 2))
     assert coarse.score[0] >= own.score[0] and coarse.method == "set 0.25m_2deg"
-    assert coarse.expected_error_m is not None and coarse.expected_error_deg is not None
+    assert coarse.expected_error_deg is not None
     assert look.at_accuracy((0.25, 2)).score(coarse.cam_from_world) == pytest.approx(coarse.score, abs=1e-6)
     with pytest.raises(ConfigError, match="joint scores"):
         look.best(place, accuracy=(0.25, 2), looks=2)
@@ -180,16 +157,12 @@ def test_views_have_an_accuracy_and_expected_errors(scorer):
 
 def sphere(radius_m):
     """The bundled scorer of landmarks on a sphere around the origin."""
-    landmarks = make_landmarks(np.random.default_rng(0), 2000)
-    points = fibonacci_sphere(2000) * radius_m
-    of_map = {
-        "triangulation_angle_deg": np.full(2000, 8.0, np.float32),
-        "mapping_distance_m": np.full(2000, radius_m, np.float32),
-        "mapping_direction": -fibonacci_sphere(2000).astype(np.float32),
-    }
-    scorer = load_scorer(
-        LocalizationMap(Map(replace(landmarks, points=points, **of_map)), PinholeCamera(400, 300, 200.0))
-    )
+    points = fibonacci_sphere(2000)
+    landmarks = make_landmarks(
+        np.random.default_rng(0), 2000, points=points * radius_m, triangulation_angle_deg=8,
+        mapping_distance_m=radius_m, mapping_direction=-points,
+    )  # fmt: skip
+    scorer = load_scorer(LocalizationMap(Map(landmarks), PinholeCamera(400, 300, 200.0)))
     assert isinstance(scorer, SetScorer)
     return scorer
 
@@ -204,19 +177,6 @@ def test_the_depth_that_is_in_range_depends_on_the_accuracy(radius_m):
         is_inside = radius_m < farthest and radius_m / accuracy_m < farthest / 0.05
         assert (at.in_range(views) == is_inside).all() and (at.report(views).in_range == is_inside).all()
         assert (at.at_accuracy(ACCURACY).in_range(views) == scorer.in_range(views)).all()
-
-
-def test_it_warns_once_of_depth_relative_to_the_accuracy():
-    scorer = sphere(6.0)
-    views = poses_looking_along(np.zeros((8, 3)), direction_lattice(8))
-    for accuracy in (ACCURACY, (0.02, 0.2), (0.25, 2.0)):
-        assert not warnings_of(scorer.at_accuracy(accuracy), views)
-    (warned,) = warnings_of(scorer.at_accuracy((0.01, 0.1)), views)
-    assert warned.startswith("set 0.01m_0.1deg: 8 of 8 views")
-    assert f"6 m (in range: {DISTANCE_M[0]:.3g} to {DISTANCE_M[1] / 5:.3g})" in warned
-    assert not warnings_of(scorer.at_accuracy((0.01, 0.1)), views)
-    (warned,) = warnings_of(sphere(35.0), views)
-    assert f"35 m (in range: {DISTANCE_M[0]:.3g} to {DISTANCE_M[1]:.3g})" in warned
 
 
 def test_depth_over_accuracy_does_not_depend_on_an_unknown_unit(tmp_path):
@@ -249,12 +209,10 @@ def warnings_of(scorer, views):
 
 def test_landmarks_mapped_from_one_place_are_out_of_range(poses):
     def seen_and_in_range(angle_deg, error_px, spread):
-        of_map = {
-            "triangulation_angle_deg": np.full(400, angle_deg, np.float32),
-            "reprojection_error_px": np.full(400, error_px, np.float32),
-            "mapping_distance_spread": np.full(400, spread, np.float32),
-        }
-        landmarks = replace(make_landmarks(np.random.default_rng(0), 400), **of_map)
+        landmarks = make_landmarks(
+            np.random.default_rng(0), 400, triangulation_angle_deg=angle_deg, reprojection_error_px=error_px,
+            mapping_distance_spread=spread,
+        )  # fmt: skip
         report = load_scorer(LocalizationMap(Map(landmarks), PinholeCamera(400, 300, 200.0))).report(poses)
         return report.in_range & (report.n_visible > 0)
 

@@ -6,6 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
+from numpy.testing import assert_allclose, assert_array_equal
 
 from learning_options import train_config
 from synthetic_dataset import CAMERA
@@ -20,10 +21,8 @@ from wheretolook.scorers.set.network import (
     MatchabilityNetwork,
     SetNetwork,
     ViewSums,
-    bearing_numbers,
     expected_cells,
     expected_parts,
-    information_matrices,
 )
 from wheretolook.training.data import labelled_rows
 from wheretolook.training.landmark_views import LandmarkBatches, load_landmark_views
@@ -45,14 +44,6 @@ def attributes_of(offsets):
 
 def some_offsets(n, seed=0):
     return np.random.default_rng(seed).uniform((-1, -1, 1), (1, 1, 4), (n, 3))
-
-
-def test_the_information_is_that_of_the_fisher_package():
-    offsets = some_offsets(40)
-    numbers = bearing_numbers(attributes_of(offsets))
-    np.testing.assert_allclose(numbers, information.bearing_numbers(offsets), rtol=1e-9, atol=1e-12)
-    matrices = information_matrices(numbers)
-    np.testing.assert_allclose(matrices, information.information_matrices(numbers.numpy()), rtol=1e-12)
 
 
 def test_expectations_in_closed_form():
@@ -92,7 +83,7 @@ def test_expected_cells_in_closed_form():
     each = torch.tensor([1.0, 2.0, 1.0], dtype=torch.float64)
     found = expected_cells(values, odds, views, each)
     # the second view's landmark stands for two: it is missed only if both are
-    np.testing.assert_allclose(found, [1 - 0.7 * 0.4 + 0.25 + 0.5, 1 - 0.1**2, 0], rtol=1e-12)
+    assert_allclose(found, [1 - 0.7 * 0.4 + 0.25 + 0.5, 1 - 0.1**2, 0], rtol=1e-12)
 
 
 def test_detection_is_learned_from_known_matches_only():
@@ -145,7 +136,6 @@ def test_unknown_attributes_become_the_mean_and_hidden_ones_are_ignored():
 def test_views_by_their_landmarks(dataset):
     scenes = training_scenes(dataset)
     views = load_landmark_views(dataset, scenes, train_config(), 20, progress=False, matches=True)
-    assert views.detected is not None
     tables = pd.concat([scene.read_table(matches=True) for scene in scenes], ignore_index=True)
     assert len(views) == len(tables) and views.scene.tolist() == np.repeat([0, 1], len(tables) // 2).tolist()
     good = is_good(tables, 0.5, 5.0)
@@ -165,7 +155,7 @@ def test_views_by_their_landmarks(dataset):
             # inliers of a wrong pose are wrong matches
             inliers = row.inlier_rows if good[at] else []
             kept = whole.rows[all_of_view].numpy()[same.int().argmax(1).numpy()]
-            np.testing.assert_array_equal(views.detected[part].numpy() > 0, np.isin(kept, inliers))
+            assert_array_equal(views.detected[part].numpy() > 0, np.isin(kept, inliers))
 
 
 def test_batches_hold_samples_of_each_view(dataset):

@@ -7,10 +7,12 @@ import numpy as np
 import pycolmap
 import pytest
 import torch
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy.special import logit
 
 from selection.room import WEIGHTS, write_room
 from synthetic_dataset import make_landmarks
+from wheretolook.dataset.scene import ColmapFiles, Scene
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import camera_centers, poses_looking_along
 from wheretolook.inputs.localization_map import LocalizationMap
@@ -117,7 +119,6 @@ def test_maps_that_do_not_show_it():
     """Stored occlusion is of all landmarks at other locations; no third image observes what two do."""
     localization_map = observed_map(0.6)
     images = localization_map.map.images
-    assert images is not None
     n = len(localization_map.landmarks)
     stored = StoredOcclusion.from_mask(np.zeros((1, 3)), np.ones((1, n), dtype=bool))
     trained = replace(bundled(), network=constant_network())
@@ -148,15 +149,14 @@ def test_it_is_added_for_photographs_only_and_to_a_copy():
     assert calibrated.offset == trained.offset + trained.photograph_offset and calibrated.photograph_offset == 0
     values = torch.zeros(5, len(trained.network.attributes))
     before, after = (one.network.matchability(values).sigmoid().numpy() for one in (trained, calibrated))
-    np.testing.assert_allclose(before, PREDICTED, rtol=1e-5)
-    np.testing.assert_allclose(after, 0.6, atol=0.03)
+    assert_allclose(before, PREDICTED, rtol=1e-5)
+    assert_allclose(after, 0.6, atol=0.03)
 
 
 def test_all_scorers_of_a_map_use_it(tmp_path):
     """Of single poses, of directions, and on the robot."""
     localization_map = observed_map(0.6)
     views = localization_map.mapping_poses
-    assert views is not None
     scorer = load_scorer(localization_map, WEIGHTS / "set.safetensors")
     plain = load_scorer(with_images(localization_map, None), WEIGHTS / "set.safetensors")
     before, after = (one.report(views).expected_inliers for one in (plain, scorer))
@@ -166,16 +166,16 @@ def test_all_scorers_of_a_map_use_it(tmp_path):
     axes = views[:1, 2, :3]
     center = camera_centers(views[:1])
     expected = scorer.score(poses_looking_along(center, axes))
-    np.testing.assert_allclose(scorer.score_directions(center, axes)[0], expected, atol=0.02)
+    assert_allclose(scorer.score_directions(center, axes)[0], expected, atol=0.02)
     folder = export_robot(localization_map, WEIGHTS / "set.safetensors", tmp_path, progress=False)
-    np.testing.assert_allclose(RobotScorer(folder).score(views), scorer.score(views), atol=1e-5)
+    assert_allclose(RobotScorer(folder).score(views), scorer.score(views), atol=1e-5)
 
 
 def test_landmarks_without_an_image_are_those_of_the_smaller_model(tmp_path):
     folder = write_room(tmp_path / "sparse", metric=False)
     opened = Map.open(folder, frame=FrameOptions(scale=1.0, up="z"))
     images = opened.images
-    assert images is not None and len(images.image_ids) == 12
+    assert len(images.image_ids) == 12
     model = pycolmap.Reconstruction(str(folder))
     for number in (2, 3, 7, 8, 12):
         model.deregister_frame(model.images[number].frame_id)
@@ -184,9 +184,32 @@ def test_landmarks_without_an_image_are_those_of_the_smaller_model(tmp_path):
     found = opened.without(images, held_out)
     few = select_points(images, images.point_ids <= images.point_ids[99])
     left = expected.ids[expected.ids <= images.point_ids[99]]
-    np.testing.assert_array_equal(opened.without(few, held_out).ids, left)
+    assert_array_equal(opened.without(few, held_out).ids, left)
     assert len(expected) < len(opened.landmarks)
-    np.testing.assert_array_equal(found.ids, expected.ids)
-    np.testing.assert_array_equal(found.track_length, expected.track_length)
+    assert_array_equal(found.ids, expected.ids)
+    assert_array_equal(found.track_length, expected.track_length)
     for name in ("triangulation_angle_deg", "mapping_direction", "mapping_distance_m", "mapping_distance_spread"):
-        np.testing.assert_allclose(getattr(found, name), getattr(expected, name), atol=1e-4)
+        assert_allclose(getattr(found, name), getattr(expected, name), atol=1e-4)
+
+
+# Log-odds of maps of photographs have the offset of the weights once; those of maps of renders have none.
+
+
+@pytest.mark.parametrize("rendered", [True, False])
+def test_the_offset_is_added_once_and_only_for_photographs(rendered, tmp_path):
+    folder = write_room(tmp_path / "sparse", metric=rendered)  # whose report then states that it is rendered
+    trained = replace(TrainedNetwork.load(WEIGHTS / "set.safetensors", SetNetwork, "set"), photograph_offset=0.7)
+    trained.save(tmp_path / "with.safetensors")
+    replace(trained, photograph_offset=0.0).save(tmp_path / "without.safetensors")
+    TrainedNetwork.load(tmp_path / "with.safetensors", SetNetwork, "set").save(tmp_path / "again.safetensors")
+    expected = 0.0 if rendered else 0.7
+    for localization_map in (
+        LocalizationMap.from_colmap(folder),
+        Scene.of_colmap(ColmapFiles(folder)).localization_map,
+    ):
+        views = localization_map.mapping_poses
+        plain, *others = (
+            load_scorer(localization_map, tmp_path / f"{name}.safetensors") for name in ("without", "with", "again")
+        )
+        for scorer in others:
+            np.testing.assert_allclose(logit(scorer.score(views)) - logit(plain.score(views)), expected, atol=1e-6)

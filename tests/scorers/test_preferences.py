@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from synthetic_dataset import make_landmarks
 from wheretolook.features.extractor import quantize_descriptors
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import poses_looking_along
@@ -26,6 +27,7 @@ def two_walls(n, seed):
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     track_length = rng.integers(2, 6, n).astype(np.int32)
     of_both = {
+        "track_length": track_length,
         "reprojection_error_px": rng.uniform(0.02, 0.3, n),
         "triangulation_angle_deg": rng.uniform(4, 30, n),
         "mapping_direction_spread": rng.uniform(0, 0.05, n),
@@ -33,15 +35,11 @@ def two_walls(n, seed):
         "mapping_distance_spread": rng.uniform(0, 0.2, n),
     }
     mirror = np.array([-1.0, 1, 1])
-    return Landmarks(
-        ids=np.arange(2 * n),
-        points=np.concatenate([left, left * mirror]),
-        mapping_direction=np.concatenate([directions, directions * mirror]).astype(np.float32),
-        descriptors=None,
-        ambiguity=max_cosine_to_other(descriptors),
-        track_length=np.tile(track_length, 2),
-        **{name: np.tile(values, 2).astype(np.float32) for name, values in of_both.items()},
-    )
+    return make_landmarks(
+        rng, 2 * n, points=np.concatenate([left, left * mirror]), ambiguity=max_cosine_to_other(descriptors),
+        mapping_direction=np.concatenate([directions, directions * mirror]), mapping_focal_px=np.nan,
+        **{name: np.tile(values, 2) for name, values in of_both.items()},
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize(("n", "seed"), [(40, 0), (80, 1), (160, 2), (400, 0)])

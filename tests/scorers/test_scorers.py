@@ -5,14 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from numpy.testing import assert_allclose, assert_array_equal
 
 from learning_options import save_network
 from synthetic_dataset import CAMERA, make_landmarks, make_mapping_poses
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.inputs.bins import BinnedViews
-from wheretolook.inputs.channels import ALL_CHANNELS, CHANNELS
-from wheretolook.inputs.landmark_features import ATTRIBUTES, LandmarkDescriber
+from wheretolook.inputs.channels import CHANNELS
+from wheretolook.inputs.landmark_features import ATTRIBUTES
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.inputs.statistics import FeatureStatistics
 from wheretolook.mapping.map import Map
@@ -25,12 +26,6 @@ from wheretolook.scorers.set.network import MatchabilityNetwork, SetNetwork
 from wheretolook.scorers.visible import VisibleScorer
 from wheretolook.scorers.weights import load_scorer
 from wheretolook.utils.errors import CameraError, ConfigError, PoseError, WeightsError
-from wheretolook_paper.scorers.conv.network import ConvNetwork, ConvSpec
-from wheretolook_paper.scorers.pooled_features import pool
-from wheretolook_paper.scorers.sphere import SphereConfig
-from wheretolook_paper.scorers.sphere.network import SphereNetwork
-from wheretolook_paper.scorers.trees import TreesConfig
-from wheretolook_paper.scorers.trees.learn import PooledViews, fit_trees
 
 
 @pytest.fixture
@@ -48,30 +43,16 @@ def views():
 NO_STATISTICS = FeatureStatistics(ATTRIBUTES, (0.0,) * len(ATTRIBUTES), (1.0,) * len(ATTRIBUTES))
 
 
-def some_trees(localization_map):
-    """Trees whose scores differ from view to view."""
-    rng = np.random.default_rng(2)
-    directions = poses_looking_along(rng.uniform((-1, -1, 1), (1, 1, 2), (300, 3)), rng.normal(size=(300, 3)))
-    values = pool(LandmarkDescriber(localization_map).describe(directions), directions, CAMERA).numpy()
-    labels = np.nan_to_num(values[:, 0] + values[:, 10]) + rng.normal(size=300) > 3
-    views = PooledViews(values, labels, np.zeros(300, int), np.arange(300), np.zeros((300, 6)))
-    return fit_trees(views, views, CAMERA, TreesConfig(max_trees=10, max_leaves=15, min_leaf=3))[0]
-
-
 def weights_of(method, path, localization_map):
     """Write untrained weights of a method, whose scores differ from view to view."""
-    if method == "trees":
-        some_trees(localization_map).save(path, {})
-        return path
     torch.manual_seed(0)
-    mean = (80.0, 60.0, 0.0, 0.0, 2.0, *[0.5] * (len(ALL_CHANNELS) - 5))
-    std = (40.0, 30.0, *[1.0] * (len(ALL_CHANNELS) - 2))
     if method.startswith("mlp"):
-        network = ViewpointNetwork(NetworkSpec(FeatureStatistics(CHANNELS, mean[:5], std[:5]), hidden=(16,)))
-    elif method == "conv":
-        network = ConvNetwork(ConvSpec(FeatureStatistics(ALL_CHANNELS, mean, std), 30, (8, 8), 0.0))
-    elif method == "sphere":
-        network = SphereNetwork(SphereConfig())
+        statistics = FeatureStatistics(CHANNELS, (80.0, 60.0, 0.0, 0.0, 2.0), (40.0, 30.0, 1.0, 1.0, 1.0))
+        network = ViewpointNetwork(NetworkSpec(statistics, hidden=(16,)))
+    elif method in ("conv", "sphere", "trees"):
+        from paper.scorers.untrained import save_untrained
+
+        return save_untrained(method, path, localization_map)
     elif method == "matchability":
         network = MatchabilityNetwork(NO_STATISTICS)
     else:
@@ -103,11 +84,11 @@ def test_scorers_keep_their_contract(name, localization_map, views, weights, mon
     order = np.random.default_rng(0).permutation(40)
     # networks compute in single precision, which a determinant or least eigenvalue of what they weigh magnifies
     rtol = 2e-5 if "expected" in name else 1e-6
-    np.testing.assert_allclose(scorer.score(views[order]), scores[order], rtol=rtol)  # a pose's score is its own
-    np.testing.assert_allclose(scorer.score(views[7:8]), scores[7:8], rtol=rtol)
-    np.testing.assert_array_equal(scorer.score_binned(views, localization_map.bin_views(views)), scores)
+    assert_allclose(scorer.score(views[order]), scores[order], rtol=rtol)  # a pose's score is its own
+    assert_allclose(scorer.score(views[7:8]), scores[7:8], rtol=rtol)
+    assert_array_equal(scorer.score_binned(views, localization_map.bin_views(views)), scores)
     monkeypatch.setattr("wheretolook.scorers.base.BLOCK", 7)
-    np.testing.assert_allclose(scorer.score(views), scores, rtol=rtol)
+    assert_allclose(scorer.score(views), scores, rtol=rtol)
     assert scorer.score(views[:0]).shape == (0,)
     unknown = replace(localization_map.landmarks, ambiguity=np.full(200, np.nan, np.float32))
     without_ambiguity = replace(localization_map, map=replace(localization_map.map, landmarks=unknown))
@@ -129,18 +110,15 @@ def _binned(counts):
 
 def test_counting_scorers_on_hand_counted_bins(localization_map):
     binned = _binned([[0, 0, 0, 0], [9, 0, 0, 0], [1, 1, 0, 0], [1, 2, 0, 0], [1, 1, 1, 1], [50, 50, 50, 50]])
-    np.testing.assert_allclose(
-        VisibleScorer(localization_map, bins=2).score_bins(binned) * 200, [0, 9, 2, 3, 4, 200], rtol=1e-12
-    )
+    assert_allclose(VisibleScorer(localization_map, bins=2).score_bins(binned) * 200, [0, 9, 2, 3, 4, 200], rtol=1e-12)
     by_bins = BinsScorer(localization_map, bins=2).score_bins(binned)
     # one bin with nine landmarks loses to two bins with one each; landmarks decide between equal bins
-    np.testing.assert_array_equal(np.argsort(by_bins), [0, 1, 2, 3, 4, 5])
-    np.testing.assert_array_equal(np.floor(by_bins * 5), [0, 1, 2, 2, 4, 4])
+    assert_array_equal(np.argsort(by_bins), [0, 1, 2, 3, 4, 5])
+    assert_array_equal(np.floor(by_bins * 5), [0, 1, 2, 2, 4, 4])
     assert by_bins.max() < 1
 
 
-def test_random_scores_are_uniform_and_depend_on_the_seed(localization_map):
-    rng = np.random.default_rng(0)
+def test_random_scores_are_uniform_and_depend_on_the_seed(rng, localization_map):
     views = poses_looking_along(np.zeros((20000, 3)), rng.normal(size=(20000, 3)))
     a, b = (make_scorer("random", localization_map, seed=seed).score(views) for seed in (0, 1))
     assert np.abs(np.histogram(a, 20, (0, 1))[0] - 1000).max() < 6 * np.sqrt(1000)
@@ -159,13 +137,13 @@ def test_learned_scores_equal_the_network_by_hand(localization_map, views, weigh
     last = network.layers[-1]
     hidden = np.maximum(values @ first.weight.numpy().T + first.bias.numpy(), 0)
     logits = hidden @ last.weight.numpy().T + last.bias.numpy()
-    np.testing.assert_allclose(scorer.score(views), 1 / (1 + np.exp(-logits[:, 0])), rtol=1e-5)
+    assert_allclose(scorer.score(views), 1 / (1 + np.exp(-logits[:, 0])), rtol=1e-5)
 
 
 def test_another_resolution_of_the_same_field_of_view_scores_the_same(localization_map, views, weights):
     double = PinholeCamera(2 * CAMERA.width, 2 * CAMERA.height, 2 * CAMERA.focal_px)
     scores = load_scorer(LocalizationMap(Map(localization_map.landmarks), double), weights).score(views)
-    np.testing.assert_allclose(scores, load_scorer(localization_map, weights).score(views), rtol=1e-5)
+    assert_allclose(scores, load_scorer(localization_map, weights).score(views), rtol=1e-5)
 
 
 @pytest.mark.parametrize(

@@ -8,8 +8,8 @@ import time
 from pathlib import Path
 
 import pytest
-from tests.disks import fill, read_only, small_disk
 
+from disks import fill, read_only, small_disk
 from wheretolook.tracking import TrackingConfig, artifact, check_store, client, experiment_id, finished_runs, start_run
 from wheretolook.utils.errors import TrackingError
 
@@ -44,7 +44,7 @@ def refused(tracking):
     with pytest.raises(TrackingError) as raised:
         check_store(tracking)
     assert time.monotonic() - start < SOON_S
-    assert raised.value.path is not None and raised.value.fix
+    assert raised.value.path and raised.value.fix
     assert "\n" not in str(raised.value)
     return raised.value
 
@@ -131,9 +131,8 @@ def begun():
 def test_two_first_runs_at_once_make_one_store(tmp_path, begun):
     begun += [_starting(tmp_path / "mlruns") for _ in range(3)]
     for process in begun:
-        assert process.stdout is not None and process.stdout.readline() == "ready\n"
+        assert process.stdout.readline() == "ready\n"
     for process in begun:
-        assert process.stdin is not None
         process.stdin.write("\n")
         process.stdin.flush()
     for process in begun:

@@ -13,21 +13,19 @@ from wheretolook.dataset.layout import Dataset
 from wheretolook.dataset.viewpoint_files import read_table, write_table
 from wheretolook.dataset.viewpoint_table import LOCALIZED, is_good
 from wheretolook.evaluation.config import EvaluateConfig
-from wheretolook.scorers.set import MatchabilityConfig, SetConfig
+from wheretolook.scorers.registry import learned
 from wheretolook.tracking import TrackingConfig
 from wheretolook.training.weights import read_weights
-from wheretolook_paper.scorers.trees import TreesConfig
 
 pytestmark = pytest.mark.usefixtures("no_pictures")
 
+METHODS = tuple({"mlp-2d+3d", "trees", "set"} & {*learned()})
 CONFIG = train_config(
-    "mlp-2d+3d",
-    "trees",
-    "set",
+    *METHODS,
     epochs=2,
-    trees=TreesConfig(max_trees=5, min_leaf=5),
-    set=SetConfig(epochs=1, landmarks=16, batch_size=16, enlarged=1.0),  # enlarged, labels follow from errors
-    matchability=MatchabilityConfig(epochs=1),
+    trees={"max_trees": 5, "min_leaf": 5},
+    set={"epochs": 1, "landmarks": 16, "batch_size": 16, "enlarged": 1.0},  # enlarged, labels follow from errors
+    matchability={"epochs": 1},
     accelerator="cpu",
 )
 
@@ -65,7 +63,7 @@ def test_only_the_labels_reach_a_learner(tmp_path, tracking):
     for first, second in zip(*(train(data, CONFIG, tracking, progress=False) for data in (one, other)), strict=True):
         tensors, others = (read_weights(model.path)[0] for model in (first, second))
         assert all(np.array_equal(tensors[name], others[name]) for name in tensors), first.method
-    config = EvaluateConfig(methods=("bins", "mlp", "trees", "set"), top_n=(1,), resamples=10)
+    config = EvaluateConfig(methods=("bins", *METHODS), top_n=(1,), resamples=10)
     columns = ["method", "raw_0.05m_0.4deg", "roc_auc", "average_precision"]
     tables = [evaluate(data, config, tracking, progress=False)[columns] for data in (one, other)]
     assert tables[0].equals(tables[1])

@@ -6,8 +6,8 @@ import sys
 from pathlib import Path
 
 import pytest
-from tests.disks import read_only, small_disk
 
+from disks import read_only, small_disk
 from wheretolook.cli import main
 from wheretolook.commands import scenes
 from wheretolook.commands.export import Export

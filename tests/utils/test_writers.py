@@ -8,10 +8,11 @@ import pandas as pd
 import pytest
 import torch
 from matplotlib.figure import Figure
-from tests.box_scenes import furnished_room
-from tests.disks import file_limit, fill, read_only, small_disk
-from tests.synthetic_dataset import CAMERA, make_mapping_poses
 
+from box_scenes import furnished_room
+from colmap_models import camera, model_of
+from disks import file_limit, fill, read_only, small_disk
+from synthetic_dataset import make_mapping_poses
 from wheretolook.dataset.viewpoint_files import SCHEMA, write_table
 from wheretolook.figures.floor_plan import save_figure
 from wheretolook.mapping.colmap_model import colmap_poses, write_model
@@ -19,8 +20,6 @@ from wheretolook.scenes.loading import save_glb
 from wheretolook.training.weights import write_weights
 from wheretolook.utils.errors import StorageError
 from wheretolook.utils.files import copy_file, save_npy, save_npz, write_text
-from wheretolook.visibility.occlusion import StoredOcclusion
-from wheretolook_paper.figures.animation import save_moving
 
 RNG = np.random.default_rng(0)
 NOISE = RNG.random(30_000)
@@ -33,18 +32,10 @@ def _figure(path):
     save_figure(figure, path)
 
 
-def _film(path):
-    save_moving(iter(RNG.integers(0, 255, (4, 120, 160, 3), np.uint8)), 125, path)
-
-
 def _table(path):
     columns = {field.name: NOISE[:4000] for field in SCHEMA if field.name != "status"}
     types = {field.name: field.type.to_pandas_dtype() for field in SCHEMA if field.name != "status"}
     write_table(pd.DataFrame({**columns, "status": "localized"}).astype(types), path)
-
-
-def _occlusion(path):
-    StoredOcclusion.from_mask(RNG.random((400, 3)), RNG.random((400, 500)) < 0.5).save(path)
 
 
 WRITERS = {
@@ -52,11 +43,9 @@ WRITERS = {
     "copy.py": lambda path: copy_file(Path(pd.__file__).with_name("conftest.py"), path),
     "a.npz": lambda path: save_npz(path, {"noise": NOISE, "more": NOISE}),
     "a.npy": lambda path: save_npy(path, NOISE),
-    "occlusion.npz": _occlusion,
     "viewpoints.parquet": _table,
     "a.safetensors": lambda path: write_weights(path, "mlp-2d", {"w": torch.from_numpy(NOISE)}, {}),
     "a.png": _figure,
-    "a.mp4": _film,
     "mesh.glb": lambda path: save_glb(furnished_room(), path),
 }
 
@@ -92,19 +81,9 @@ def test_a_writer_that_fails_names_the_file_and_leaves_no_part(name, disk, tmp_p
         assert path.read_bytes() == before
 
 
-def _model(n_images):  # a pycolmap.Reconstruction
-    import pycolmap
-
-    model = pycolmap.Reconstruction()
-    model.add_camera_with_trivial_rig(pycolmap.Camera(camera_id=1, **CAMERA.colmap.record()))
-    for number, pose in enumerate(make_mapping_poses(0, n_images), 1):
-        image = pycolmap.Image(name=f"{number:05d}.png", camera_id=1, image_id=number)
-        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pycolmap.Rotation3d(pose[:, :3]), pose[:, 3]))
-    return model
-
-
 def test_a_model_that_colmap_wrote_in_part_is_an_error(tmp_path):
-    model = _model(400)
+    images = [(f"{row:05d}.png", 1, pose, np.zeros((0, 2))) for row, pose in enumerate(make_mapping_poses(0, 400))]
+    model = model_of([camera(1, "PINHOLE", 160, 120, 80, 80, 80, 60)], images)
     write_model(model, tmp_path / "whole")
     assert len(colmap_poses(tmp_path / "whole")) == 400
     with file_limit(LIMIT), pytest.raises(StorageError) as raised:

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import warp as wp
+from numpy.testing import assert_array_equal
 
 from twins.visibility import count_plain
 from wheretolook.geometry.camera import ColmapCamera, PinholeCamera
@@ -50,28 +51,26 @@ def test_counts_are_those_of_the_plain_twin(name, random_views, device):
     rotations = rotation_looking_along(v.directions)
     counts = count(camera, rotations, v.locations, points, mask, device)
     plain = count_plain(camera, rotations, v.locations, points, mask)
-    np.testing.assert_array_equal(counts, plain)
+    assert_array_equal(counts, plain)
     assert plain.max() > 5 and (name == "panorama" or plain.min() < plain.max())
 
 
-def test_a_hundred_thousand_landmarks_on_the_very_border(device):
+def test_a_hundred_thousand_landmarks_on_the_very_border(rng, device):
     """Landmarks made to lie within single precision's error of the sides of some view: each must be decided alike."""
     camera = PinholeCamera()
     rotations = rotation_looking_along(fibonacci_sphere(40))
-    rng = np.random.default_rng(0)
     pixels = np.stack([rng.choice([0.0, 640.0], 100_000), rng.uniform(0, 480, 100_000)], 1)
     pixels[::2] = np.stack([rng.uniform(0, 640, 50_000), rng.choice([0.0, 480.0], 50_000)], 1)
     rays = np.concatenate([(pixels - (320, 240)) / 320, np.ones((100_000, 1))], 1) * rng.uniform(0.5, 8, (100_000, 1))
     points = np.einsum("nji,nj->ni", rotations[rng.integers(0, 40, 100_000)], rays)
     mask = np.ones((1, len(points)), bool)
     counts = count(camera, rotations, np.zeros((1, 3)), points, device=device)
-    np.testing.assert_array_equal(counts, count_plain(camera, rotations, np.zeros((1, 3)), points, mask))
+    assert_array_equal(counts, count_plain(camera, rotations, np.zeros((1, 3)), points, mask))
 
 
 @pytest.mark.parametrize("camera", [DISTORTED, FISHEYE, PANORAMA])
-def test_the_table_of_a_field_of_view_is_never_wrong(camera):
+def test_the_table_of_a_field_of_view_is_never_wrong(rng, camera):
     table = tabulate(camera)
-    rng = np.random.default_rng(0)
     u, v = rng.uniform(-1, 1, (2, 300_000))
     directions = octahedral_directions(u, v)
     depth = table.depth_rad[cells_of(directions, table.size)]
@@ -88,15 +87,12 @@ def test_the_table_of_a_field_of_view_is_never_wrong(camera):
         ColmapCamera("PINHOLE", 640, 480, (300.0, 500.0, -100.0, 900.0)),
     ],
 )
-def test_a_view_narrower_than_the_tables_cells_is_counted_too(camera, device):
-    rng = np.random.default_rng(0)
+def test_a_view_narrower_than_the_tables_cells_is_counted_too(rng, camera, device):
     pixels = rng.uniform(-0.5, 1.5, (2000, 2)) * (camera.width, camera.height)
     points = camera.unproject(pixels) * rng.uniform(1, 5, (2000, 1))
     rotations = np.concatenate([np.eye(3)[None], rotation_looking_along(fibonacci_sphere(5))])
     counts = count(camera, rotations, np.zeros((1, 3)), points, device=device)
-    np.testing.assert_array_equal(
-        counts, count_plain(camera, rotations, np.zeros((1, 3)), points, np.ones((1, 2000), bool))
-    )
+    assert_array_equal(counts, count_plain(camera, rotations, np.zeros((1, 3)), points, np.ones((1, 2000), bool)))
     assert 300 < counts[0, 0] < 1000
 
 
@@ -108,4 +104,4 @@ def test_lists_for_the_camera_that_run_over_change_nothing(random_views, device,
     for entries in (1, 60):  # shorter than the list of one view, and than that of all
         short = {"scratch_bytes": 20 * entries}
         found = count(DISTORTED, rotations, v.locations, v.points, v.mask, device, **short)
-        np.testing.assert_array_equal(found, expected)
+        assert_array_equal(found, expected)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from numpy.testing import assert_array_equal
 
 from wheretolook.geometry.camera import ColmapCamera, PinholeCamera
 from wheretolook.geometry.poses import rotation_looking_along, transform
@@ -65,7 +66,7 @@ def test_the_test_is_the_projection(random_views):
         clear = (gap > 1e-3) & (np.abs(in_camera[..., 2] - MIN_DEPTH_M) > 1e-6)
         truth = (in_camera[..., 2] > MIN_DEPTH_M) & v.camera.in_image(pixels)
         assert clear.mean() > 0.999 and truth.any()
-        np.testing.assert_array_equal(seen[clear], truth[clear])
+        assert_array_equal(seen[clear], truth[clear])
 
 
 @pytest.mark.parametrize("at_once", [frustum.CANDIDATES_AT_ONCE, 1000, 1])
@@ -75,8 +76,8 @@ def test_collected_landmarks_are_those_of_the_plain_twin(random_views, at_once, 
     arguments = PosedViews(v.camera, v.cam_from_world, v.points, v.visible, v.location_rows)
     kernel = landmarks_in_view(arguments, device=device)
     plain = landmarks_in_view_plain(arguments)
-    np.testing.assert_array_equal(kernel.starts, plain.starts)
-    np.testing.assert_array_equal(kernel.indices, plain.indices)
+    assert_array_equal(kernel.starts, plain.starts)
+    assert_array_equal(kernel.indices, plain.indices)
     assert len(plain.indices) > 500 and len(plain) == len(v.cam_from_world)
     for view in range(len(plain)):
         assert v.mask[v.location_rows[view], plain[view]].all()

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import warp as wp
+from numpy.testing import assert_array_equal
 
 from box_scenes import box_quads, quads_mesh, random_texture
 from twins.visibility import count_plain
@@ -42,13 +43,13 @@ def test_a_survey_is_what_its_plain_parts_say(random_views, threads, device):
     options = SurveyOptions(keep=6, device=device, threads=threads)
     seen = survey(v.camera, rotations, v.locations, v.points, Given(v.locations, v.mask), options)
     plain = count_plain(v.camera, rotations, v.locations, v.points, v.mask)
-    np.testing.assert_array_equal(seen.counts, plain)
+    assert_array_equal(seen.counts, plain)
     for row in range(len(v.locations)):
         ranked = sorted(range(len(rotations)), key=lambda direction: (-plain[row, direction], direction))
         assert seen.best[row].tolist() == ranked[:6]
-    assert seen.occlusion is not None and seen.occlusion.name == "custom"
-    np.testing.assert_array_equal(seen.occlusion.mask, v.mask)
-    np.testing.assert_array_equal(seen.occlusion.unoccluded(v.locations[2:4], v.points), v.mask[2:4])
+    assert seen.occlusion.name == "custom"
+    assert_array_equal(seen.occlusion.mask, v.mask)
+    assert_array_equal(seen.occlusion.unoccluded(v.locations[2:4], v.points), v.mask[2:4])
 
 
 @pytest.mark.parametrize(("directions", "keep"), [(1, 1), (40, 40), (300, 7)])
@@ -56,7 +57,7 @@ def test_the_best_directions_are_those_of_a_stable_sort(directions, keep, device
     counts = np.random.default_rng(0).integers(0, 9, (6, directions)).astype(np.int32)
     best = wp.empty((6, keep), dtype=wp.int32, device=start_warp(device))
     wp.launch(best_kernel, counts.shape, [wp.array(counts, device=device), directions, keep], [best], device=device)
-    np.testing.assert_array_equal(best.numpy(), np.argsort(-counts, axis=1, kind="stable")[:, :keep])
+    assert_array_equal(best.numpy(), np.argsort(-counts, axis=1, kind="stable")[:, :keep])
 
 
 @pytest.mark.parametrize("n_points", [1, 7, 8, 9, 800])
@@ -67,13 +68,11 @@ def test_masks_of_every_length_are_packed_as_numpy_packs_them(n_points, random_v
     rotations = rotation_looking_along(v.directions)
     for occlusion, expected in ((Given(v.locations, mask), mask), (NoOcclusion(), np.ones_like(mask))):
         seen = survey(v.camera, rotations, v.locations, points, occlusion, SurveyOptions(device=device))
-        assert seen.occlusion is not None
-        np.testing.assert_array_equal(seen.occlusion.packed, np.packbits(expected, axis=1))
+        assert_array_equal(seen.occlusion.packed, np.packbits(expected, axis=1))
 
 
-def test_a_mesh_hides_what_is_behind_it_on_the_device_too(device):
+def test_a_mesh_hides_what_is_behind_it_on_the_device_too(rng, device):
     raycaster = MeshRaycaster(boxes(box_quads((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5))), device)
-    rng = np.random.default_rng(0)
     points = rng.uniform(-4, 4, (600, 3))
     locations = rng.uniform(2, 4, (20, 3))
     occlusion = MeshOcclusion(raycaster)
@@ -81,8 +80,8 @@ def test_a_mesh_hides_what_is_behind_it_on_the_device_too(device):
     seen = survey(PinholeCamera(), rotations, locations, points, occlusion, SurveyOptions(device=device))
     mask = occlusion.unoccluded(locations, points)
     assert 0 < (~mask).sum() < mask.size / 2 and seen.occlusion is not None
-    np.testing.assert_array_equal(seen.occlusion.mask, mask)
-    np.testing.assert_array_equal(seen.counts, count_plain(PinholeCamera(), rotations, locations, points, mask))
+    assert_array_equal(seen.occlusion.mask, mask)
+    assert_array_equal(seen.counts, count_plain(PinholeCamera(), rotations, locations, points, mask))
 
 
 def test_blocks_keep_to_the_memory_allowed(random_views, device, monkeypatch):
@@ -104,7 +103,7 @@ def test_blocks_keep_to_the_memory_allowed(random_views, device, monkeypatch):
         blocks.clear()
         limited = replace(options, threads=threads, memory_bytes=memory)
         part = survey(v.camera, rotations, locations, v.points, NoOcclusion(), limited)
-        np.testing.assert_array_equal(part.counts, whole.counts)
+        assert_array_equal(part.counts, whole.counts)
         assert sum(blocks) == 40 and max(blocks) <= longest
 
 

@@ -15,9 +15,6 @@ from wheretolook.geometry.poses import Float
 PERSON_M = (1.7, 0.5)
 """Height and width of an occluder in metres."""
 
-SHADES = ((1, 1), (9, 3), (170, 50))
-"""Rows and columns of an occluder's shades of one colour: plain, checked or noise."""
-
 READ_NOISE = 1 / 30
 """Standard deviation of noise in black, over that of shot noise in white."""
 
@@ -126,7 +123,7 @@ def _occlude(
     distance = 4 ** rng.random()
     rows = (down * distance - rng.uniform(1, height)) / height + 1
     columns = (right - rng.choice(right[0])) * distance / width + 0.5
-    n_rows, n_columns = rng.choice(SHADES)
+    n_rows, n_columns = rng.choice(((1, 1), (9, 3), (170, 50)))  # of its shades: plain, checked or noise
     colors = rng.uniform(0.1, 1, (n_rows, n_columns, 1)) * rng.uniform(0.1, 0.5, 3)
     colors = colors[(rows * n_rows).astype(int) % n_rows, (columns * n_columns).astype(int) % n_columns]
     hidden = (abs(rows - 0.5) < 0.5) & (abs(columns - 0.5) < 0.5) & ((depth_m <= 0) | (depth_m > distance))

@@ -169,8 +169,6 @@ def trace_kernel(
 
 # Triangles are widened by this many pixels, so that rounding opens no gap between neighbours.
 _SLACK = wp.constant(wp.float64(1.0e-9))
-# Up to this sine of the angle between a triangle's plane and the camera, the camera counts as in the plane.
-_FLAT = wp.constant(wp.float64(1.0e-13))
 
 
 @wp.kernel(enable_backward=False)
@@ -239,7 +237,8 @@ def raster_kernel(
     n1 = wp.cross(p2, p0)
     n2 = wp.cross(p0, p1)
     volume = wp.dot(p0, n0)
-    if wp.abs(volume) <= _FLAT * wp.length(p0) * wp.length(n0):
+    # up to a sine of 1e-13 of the angle between the triangle's plane and the camera, the camera counts as in the plane
+    if wp.abs(volume) <= wp.float64(1.0e-13) * wp.length(p0) * wp.length(n0):
         return  # edge-on: rounding would decide which side a pixel sees
     if volume < zero:
         n0 = -n0

@@ -16,9 +16,6 @@ from wheretolook.utils.warp import start_warp, vec3_array
 
 wp.set_module_options({"enable_backward": False})
 
-BLOCK_DIM = 64  # threads of a block on a GPU: rays of a block wait for its longest
-BLOCK_RAYS = 1 << 28  # traced at a time by `occluded`, to bound the memory on the device
-
 
 @wp.kernel
 @no_type_check
@@ -127,7 +124,8 @@ class MeshRaycaster:
         n_points = points_on_device.shape[0]
         occluded = np.zeros((len(origins_at), n_points), dtype=np.bool_)
         threads = cores() if self.device == "cpu" else 1
-        block = max(1, min(BLOCK_RAYS // max(n_points, 1), -(-len(origins_at) // threads)))
+        # 2^28 rays at a time, to bound the memory on the device
+        block = max(1, min((1 << 28) // max(n_points, 1), -(-len(origins_at) // threads)))
 
         def work(start: int) -> None:
             rows = slice(start, start + block)
@@ -175,7 +173,8 @@ class MeshRaycaster:
     def _launch(self, kernel: Any, shape: tuple[int, ...], inputs: list[Any], *dtypes: Any) -> list[Any]:
         """New arrays of a shape, one for each type, that a kernel has filled."""
         outputs = [wp.empty(shape, dtype=dtype, device=self.device) for dtype in dtypes]
-        wp.launch(kernel, shape, [self.warp_mesh.id, *inputs], outputs, device=self.device, block_dim=BLOCK_DIM)
+        # few threads a block: its rays wait for the longest
+        wp.launch(kernel, shape, [self.warp_mesh.id, *inputs], outputs, device=self.device, block_dim=64)
         return outputs
 
 

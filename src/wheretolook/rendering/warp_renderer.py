@@ -134,9 +134,6 @@ def camera_rays(camera: PinholeCamera, cam_from_world: Float) -> tuple[Float, Fl
     return centers, rotation @ np.linalg.inv(camera.matrix)
 
 
-MARGIN_PX = 2  # of each face of the cube around its 90 degrees, for interpolation at its edges
-LARGEST_FACE_PX = 4096  # a camera that magnifies more is rendered less sharply than it could see
-
 _FACES = np.array([
     [[1, 0, 0], [0, 1, 0], [0, 0, 1]],  # ahead
     [[0, 0, -1], [0, 1, 0], [1, 0, 0]],  # right
@@ -171,8 +168,8 @@ def render_distorted(renderer: Renderer, camera: ColmapCamera, cam_from_world: F
 
 
 def _face_camera(camera: ColmapCamera) -> PinholeCamera:
-    focal = min(LARGEST_FACE_PX / 2, np.ceil(camera.mean_focal_px))
-    side = int(2 * (focal + MARGIN_PX))
+    focal = min(2048, np.ceil(camera.mean_focal_px))  # a camera that magnifies more is rendered less sharply
+    side = int(2 * (focal + 2))  # beyond the 90 degrees of a face, 2 pixels for interpolation at its edges
     return PinholeCamera(side, side, float(focal))
 
 

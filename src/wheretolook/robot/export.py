@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import io
+import json
 import warnings
 from collections.abc import Iterator
 from copy import deepcopy
@@ -26,6 +27,7 @@ from wheretolook.geometry.camera import Camera, ColmapCamera, PinholeCamera, des
 from wheretolook.geometry.poses import Float
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.landmarks import MAP_ATTRIBUTES, Landmarks
+from wheretolook.robot.wheretolook_robot import FILES, FORMAT_VERSION, description_digest, file_digest
 from wheretolook.scorers.set.accuracy import AccuracyModel
 from wheretolook.scorers.set.network import CELLS, SetNetwork, ViewSums, expected_parts
 from wheretolook.scorers.set.score import MAX_LANDMARKS, for_map
@@ -257,7 +259,9 @@ def export_robot(
     write_bytes(out / "scorer.onnx", content)
     save_npz(out / "landmarks.npz", arrays)
     copy_file(Path(__file__).with_name("wheretolook_robot.py"), out / "wheretolook_robot.py")
-    write_json(out / "robot.json", about)
+    about["files"] = {name: file_digest(out / name) for name in FILES if (out / name).is_file()}
+    about = json.loads(json.dumps(about))  # with the types that are read
+    write_json(out / "robot.json", about | {"sha256": description_digest(about)})
     return out
 
 
@@ -265,7 +269,7 @@ def _description(trained: TrainedNetwork[SetNetwork], camera: PinholeCamera, acc
     """Describe camera, inputs, accuracy and training range of a network for robot.json."""
     training_range = trained.range_at(accuracy)
     return {
-        "format_version": 1,  # of the folder, as in wheretolook_robot.py
+        "format_version": FORMAT_VERSION,
         "wheretolook": VERSION,
         "camera": {name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")},
         "attributes": list(trained.network.attributes),

@@ -17,7 +17,6 @@ Pixel (0.5, 0.5) is the centre of the top-left pixel. Descriptors are RootSIFT t
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -50,6 +49,7 @@ from wheretolook.localization.rig_localization import (
     JointLocalizer,
 )
 from wheretolook.looks.next_look import DirectionScorer, NextLook, NextLookSelector
+from wheretolook.robot.wheretolook_robot import read_description
 from wheretolook.utils.errors import ConfigError
 
 GROUP = 32  # landmarks; the best groups are selected first, and in them the best landmarks
@@ -106,9 +106,7 @@ class RobotLocalizer:
 
     def __init__(self, folder: str | Path, turn_noise_deg: float = 0.2, in_world: bool = False) -> None:
         folder = Path(folder)
-        about = json.loads((folder / "robot.json").read_text(encoding="utf-8"))
-        if about.get("format_version") != 1:
-            raise ValueError(f"{folder}: this program reads format 1. Export again.")
+        about = read_description(folder)
         self._world_from_map = Similarity(1.0, np.eye(3), np.zeros(3))
         if not in_world:
             frame = about["world_from_map"]
@@ -121,9 +119,9 @@ class RobotLocalizer:
         with np.load(folder / "landmarks.npz", allow_pickle=False) as stored:
             points = stored["points"]
             distance = stored["attributes"][:, about["map_attributes"].index("mapped_distance")]
+        if "descriptors.npy" not in about["files"]:
+            raise ValueError(f"{folder}: exported without descriptors. Export again with --localize.")
         descriptors = np.load(folder / "descriptors.npy", allow_pickle=False)
-        if descriptors.shape != (len(points), 128) or descriptors.dtype != np.uint8:
-            raise ValueError(f"{folder}: descriptors and landmarks are of different exports. Export again.")
         padded = -(-max(len(points), NEAREST * GROUP) // GROUP) * GROUP
         self.n_landmarks = len(points)
         self._descriptors = np.zeros((128, padded), dtype=np.float32)
@@ -132,8 +130,7 @@ class RobotLocalizer:
         self._localizer = JointLocalizer(PoseEstimator(points, self._config), turn_noise_deg, check_turns=True)
         self._points = points
         self._mapping_distance_m = np.exp(distance)
-        scores = folder / "mean_scores.npy"
-        self._mean_scores = np.load(scores, allow_pickle=False) if scores.is_file() else None
+        self._mean_scores = np.load(folder / "mean_scores.npy", allow_pickle=False)
         self._sift: RootSift | None = None
 
     def extract(self, grey: NDArray[np.uint8]) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
@@ -236,8 +233,6 @@ class RobotLocalizer:
 
         Raises ValueError if the folder is of another version, PlanningError if the limits leave no new view.
         """
-        if self._mean_scores is None:
-            raise ValueError("the folder has no mean_scores.npy. Export again.")
         return NextLookSelector(scorer, self._mean_scores).select(result.joint, up, pitch_deg, pan_deg)
 
     def nearest(

@@ -11,8 +11,8 @@ This file needs NumPy and onnxruntime, neither PyTorch nor the rest of wheretolo
         attributes  (N, M) float32, attributes of each landmark; NaN if unknown
         places      (L, 3) float64, locations with known occlusion; L = 0 without
         unoccluded  (L, ceil(N / 8)) uint8, bits packed by `numpy.packbits`: 1 if the landmark is unoccluded
-    robot.json      camera, accuracy in metres and degrees, names of the attributes, range of the training views, and
-                    the similarity from the map's own frame to the world
+    robot.json      camera, accuracy in metres and degrees, names of the attributes, range of the training views, the
+                    similarity from the map's own frame to the world, and digests of all files
 
 Usage, in that folder:
 
@@ -39,6 +39,7 @@ run the network. Scores equal those of wheretolook's PyTorch scorer within 1e-5.
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
@@ -47,12 +48,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import onnxruntime
 from numpy.typing import ArrayLike, NDArray
 
-FORMAT_VERSION = 1  # of the folder
-CAMERA = ("width", "height", "fx", "fy", "cx", "cy")
-COMPUTED = {"across", "down", "distance", "mapped_angle", "distance_ratio", "pixel_angle", "pixel_size_ratio"}
+FORMAT_VERSION = 2  # of the folder
+FILES = ("landmarks.npz", "scorer.onnx", "descriptors.npy", "mean_scores.npy")
 OUTPUTS = ("probability", "expected_inliers")
 FREE_BYTES = 128_000_000  # that landmarks.npz may expand to, whatever its size
 
@@ -84,6 +83,48 @@ class BestView:
     place_distance: float
 
 
+def description_digest(about: dict[str, Any]) -> str:
+    """Return the SHA-256 of the content of robot.json, apart from this digest."""
+    return hashlib.sha256(json.dumps(about, sort_keys=True).encode()).hexdigest()
+
+
+def file_digest(path: Path) -> str:
+    """Return the SHA-256 of a file."""
+    digest = hashlib.sha256()
+    with path.open("rb") as file:
+        while block := file.read(1 << 20):
+            digest.update(block)
+    return digest.hexdigest()
+
+
+def read_description(folder: Path) -> dict[str, Any]:
+    """Read robot.json of a folder, and compare it and the files that it names with the digests of the export.
+
+    Raises OSError if a file is missing, ValueError if one has changed, or if the folder is of another format version.
+    """
+    path = folder / "robot.json"
+    if not path.is_file():  # missing, a folder, device or pipe
+        raise FileNotFoundError(f"{path}: no such file. Export again.")
+    try:
+        if path.stat().st_size > 1_000_000:
+            raise ValueError("larger than a megabyte")
+        about: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        if about["format_version"] != FORMAT_VERSION:
+            raise ValueError(f"this program reads format {FORMAT_VERSION}")
+        if about.pop("sha256") != description_digest(about):
+            raise ValueError("changed since the export")
+        digests = {folder / name: about["files"][name] for name in FILES if name in about["files"]}
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        problem = f"{error} is missing" if isinstance(error, KeyError) else str(error)
+        raise ValueError(f"{path}: the settings cannot be used: {problem}. Export again.") from error
+    for file, digest in digests.items():
+        if not file.is_file():
+            raise FileNotFoundError(f"{file}: no such file. Export again.")
+        if file_digest(file) != digest:
+            raise ValueError(f"{file}: changed since the export. Export again.")
+    return about
+
+
 class RobotScorer:
     """Scores views of a map exported by `wheretolook export`.
 
@@ -93,84 +134,41 @@ class RobotScorer:
 
     Raises:
         OSError: a file is missing.
-        ValueError: a file is damaged, of another format version, has impossible values, or does not match the others.
+        ValueError: a file has changed since the export, or is of another format version.
     """
 
     def __init__(self, folder: str | Path, threads: int = 1) -> None:
+        import onnxruntime  # which localizing does not need
+
         folder = Path(folder)
-        for path in (folder / "robot.json", folder / "landmarks.npz", folder / "scorer.onnx"):
-            if not path.is_file():  # missing, a folder, device or pipe
-                raise FileNotFoundError(f"{path}: no such file. Export again.")
-        n_landmarks = self._read_settings(folder / "robot.json")
-        self._read_landmarks(folder / "landmarks.npz", n_landmarks)
+        about = read_description(folder)
+        self.camera: dict[str, float] = about["camera"]  # in pixels
+        self._names: list[str] = about["attributes"]  # inputs of the network, in its order
+        self._map_names: list[str] = about["map_attributes"]  # columns of `attributes`
+        self._most: int = about["most"]  # landmarks per view; of more, an even sample
+        self._range: dict[str, list[float]] = about["range"]
+        self._serves_camera: bool = about["serves_camera"]
+        frame = about["world_from_map"]
+        self._scale: float = frame["scale"]  # metres in a unit of the map
+        self._rotation = np.array(frame["rotation"], dtype=np.float64)
+        self._translation = np.array(frame["translation"], dtype=np.float64)
+        self._read_landmarks(folder / "landmarks.npz")
         self._columns = np.ascontiguousarray(self.points.T)  # (3, N): contiguous coordinates are faster
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = threads
         options.inter_op_num_threads = 1
         options.add_session_config_entry("session.intra_op.allow_spinning", "0")  # idle threads release the core
-        path = folder / "scorer.onnx"
-        try:
-            self._session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
-            shapes = {value.name: value.shape for value in self._session.get_inputs()}
-            outputs = {value.name for value in self._session.get_outputs()}
-            inputs = {"values", "taken", "n_visible"}
-            if {*shapes} != inputs or shapes["values"][-1] != len(self._names) or not {*OUTPUTS} <= outputs:
-                raise ValueError("it is of another network")
-        except Exception as error:  # onnxruntime raises errors of many kinds
-            raise ValueError(f"{path}: the network cannot be read: {error}. Export again.") from error
+        network = str(folder / "scorer.onnx")
+        self._session = onnxruntime.InferenceSession(network, options, providers=["CPUExecutionProvider"])
 
-    def _read_settings(self, path: Path) -> int:
-        """Read robot.json and return its number of landmarks. Raises ValueError for impossible settings."""
-        try:
-            about = json.loads(path.read_text(encoding="utf-8"))
-            if about["format_version"] != FORMAT_VERSION:
-                raise ValueError(f"this program reads format {FORMAT_VERSION}")
-            self.camera: dict[str, float] = {name: float(about["camera"][name]) for name in CAMERA}  # in pixels
-            positive = min(self.camera[name] for name in CAMERA[:4])
-            if not (positive > 0 and (np.abs([*self.camera.values()]) < 1e6).all()):
-                raise ValueError(f"the camera has an impossible size or focal length: {self.camera}")
-            self._names = [str(name) for name in about["attributes"]]  # inputs of the network, in its order
-            self._map_names = [str(name) for name in about["map_attributes"]]  # columns of `attributes`
-            if not {"across", "down", "distance"} <= {*self._names} <= {*self._map_names} | COMPUTED:
-                raise ValueError("attributes are missing or unknown")
-            if not {"mapped_distance", "mapped_pixel_size"} <= {*self._map_names}:
-                raise ValueError("attributes of the map are missing")
-            self._most = int(about["most"])  # landmarks per view; of more, an even sample
-            n_landmarks = int(about["n_landmarks"])
-            if self._most < 1 or n_landmarks < 0:
-                raise ValueError(f"impossible numbers of landmarks: most {self._most}, n_landmarks {n_landmarks}")
-            self._range = {name: (float(low), float(high)) for name, (low, high) in about["range"].items()}
-            if not all(low <= high for low, high in self._range.values()):
-                raise ValueError(f"the range of the training views is not ascending: {self._range}")
-            self._serves_camera = bool(about["serves_camera"])
-            frame = about["world_from_map"]
-            self._scale = float(frame["scale"])  # metres in a unit of the map
-            self._rotation = np.array(frame["rotation"], dtype=np.float64).reshape(3, 3)
-            self._translation = np.array(frame["translation"], dtype=np.float64).reshape(3)
-            if not (0 < self._scale < np.inf and np.isfinite([*self._rotation, self._translation]).all()):
-                raise ValueError(f"world_from_map is no similarity: {frame}")
-            return n_landmarks
-        except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
-            problem = f"{error} is missing" if isinstance(error, KeyError) else str(error)
-            raise ValueError(f"{path}: the settings cannot be used: {problem}. Export again.") from error
-
-    def _read_landmarks(self, path: Path, n: int) -> None:
-        """Read landmarks.npz with n landmarks. Raises ValueError for arrays that are missing or do not match."""
-        shapes = {"points": (n, 3), "directions": (n, 3), "attributes": (n, len(self._map_names))}
+    def _read_landmarks(self, path: Path) -> None:
+        """Read landmarks.npz. Raises ValueError if it cannot be read, or would fill the memory."""
         try:
             with np.load(path, allow_pickle=False) as stored:
                 n_bytes = sum(member.file_size for member in stored.zip.infolist())
                 if n_bytes > max(FREE_BYTES, 100 * path.stat().st_size):
                     raise ValueError(f"it would expand to {n_bytes:,} bytes")
-                arrays = {name: stored[name] for name in (*shapes, "places", "unoccluded")}
-            shapes |= {"places": (len(arrays["places"]), 3), "unoccluded": (len(arrays["places"]), (n + 7) // 8)}
-            for name, array in arrays.items():
-                kind = "u" if name == "unoccluded" else "f"
-                if array.shape != shapes[name] or array.dtype.kind != kind:
-                    raise ValueError(f"{name} is {array.dtype} {array.shape}, robot.json expects {shapes[name]}")
-                unusable = np.isinf if name == "attributes" else lambda values: ~np.isfinite(values)
-                if unusable(array).any():
-                    raise ValueError(f"{name} is not finite")
+                arrays = {name: stored[name] for name in ("points", "directions", "attributes", "places", "unoccluded")}
         except Exception as error:  # a damaged archive raises errors of many kinds
             raise ValueError(f"{path}: the landmarks cannot be used: {error}. Export again.") from error
         self.points: Array = arrays["points"]

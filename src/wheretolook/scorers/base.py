@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from wheretolook.visibility.frustum import LandmarkSets
 
 BLOCK = 4096  # views scored at a time: about 80 MB of bins
-FIELD_OF_VIEW_TOLERANCE = 1e-3  # relative difference in size / focal length and of the principal point
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,4 +165,4 @@ def same_field_of_view(trained: Camera, camera: Camera) -> bool:
     if isinstance(camera, ColmapCamera) or isinstance(trained, ColmapCamera):
         return False
     spans = [(c.width / c.fx, c.height / c.fy, c.cx / c.width, c.cy / c.height) for c in (trained, camera)]
-    return bool(np.allclose(spans[0], spans[1], rtol=FIELD_OF_VIEW_TOLERANCE, atol=0))
+    return bool(np.allclose(spans[0], spans[1], rtol=1e-3, atol=0))

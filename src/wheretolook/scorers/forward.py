@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from wheretolook.geometry.poses import Float, camera_centers, check_poses
 from wheretolook.scorers.base import Scorer
 from wheretolook.scorers.random import uniform
-from wheretolook.scorers.registry import BuildOptions, rule
+from wheretolook.scorers.registry import rule
 
 if TYPE_CHECKING:
     from wheretolook.inputs.localization_map import LocalizationMap
@@ -56,9 +56,11 @@ class ForwardScorer(Scorer):
         return np.asarray((1 + np.clip(cosines, -1, 1)) / 2)
 
 
-def _build(localization_map: LocalizationMap, options: BuildOptions) -> Scorer:
-    heading = options.heading[0] if len(options.heading) == 1 else options.heading or None
-    return ForwardScorer(localization_map, heading, options.seed)
-
-
-METHODS = (rule(ForwardScorer, build=_build),)
+METHODS = (
+    rule(
+        ForwardScorer,
+        build=lambda map, options: ForwardScorer(
+            map, options.heading[0] if len(options.heading) == 1 else options.heading or None, options.seed
+        ),
+    ),
+)

@@ -9,12 +9,10 @@ from numpy.typing import NDArray
 
 from wheretolook.geometry.poses import Float, check_poses
 from wheretolook.scorers.base import Scorer
-from wheretolook.scorers.registry import BuildOptions, rule
+from wheretolook.scorers.registry import rule
 
 if TYPE_CHECKING:
     from wheretolook.inputs.localization_map import LocalizationMap
-
-POSE_DECIMALS = 6  # poses that agree to this many decimals (of a metre, and in the rotation matrix) get the same score
 
 
 class RandomScorer(Scorer):
@@ -32,8 +30,8 @@ class RandomScorer(Scorer):
 
 
 def uniform(values: Float, seed: int) -> Float:
-    """Return uniform numbers (B,) in [0, 1), a function of rows (B, K), up to `POSE_DECIMALS`, and the seed."""
-    numbers = np.round(values * 10**POSE_DECIMALS).astype(np.int64)
+    """Return uniform numbers (B,) in [0, 1), a function of rows (B, K), to six decimals, and the seed."""
+    numbers = np.round(values * 1e6).astype(np.int64)
     state = np.full(len(numbers), seed, dtype=np.uint64)
     for column in numbers.T:
         state = _splitmix64(state ^ column.astype(np.uint64))
@@ -48,8 +46,4 @@ def _splitmix64(state: NDArray[np.uint64]) -> NDArray[np.uint64]:
     return state ^ (state >> np.uint64(31))
 
 
-def _build(localization_map: LocalizationMap, options: BuildOptions) -> Scorer:
-    return RandomScorer(localization_map, options.seed)
-
-
-METHODS = (rule(RandomScorer, build=_build),)
+METHODS = (rule(RandomScorer, build=lambda map, options: RandomScorer(map, options.seed)),)

@@ -14,6 +14,7 @@ from pkgutil import resolve_name
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
+from wheretolook.training.weights import method_of_weights, read_training
 from wheretolook.utils.errors import CameraError, ConfigError, OutOfRangeWarning, WeightsError, did_you_mean
 from wheretolook.utils.package import WEIGHTS, or_shipped
 
@@ -79,15 +80,15 @@ def imported(reference: str) -> Callable[..., Any]:
     return lambda *arguments: resolve_name(reference)(*arguments)
 
 
-def network_scorer(scorer: str, network: str, *methods: str) -> Callable[[LocalizationMap, BuildOptions], Scorer]:
-    """Return a function that builds a scorer from weights of these methods; both classes as in `imported`."""
+def network_scorer(scorer: str, network: str, method: str) -> Callable[[LocalizationMap, BuildOptions], Scorer]:
+    """Return a function that builds a scorer from weights of a method; both classes as in `imported`."""
 
     def build(localization_map: LocalizationMap, options: BuildOptions) -> Scorer:
         from wheretolook.training.trained_network import TrainedNetwork
 
         assert options.weights is not None
         network_class: Any = resolve_name(network)
-        trained = TrainedNetwork.load(options.weights, network_class, *methods, device=localization_map.device)
+        trained = TrainedNetwork.load(options.weights, network_class, method, device=localization_map.device)
         built: Scorer = resolve_name(scorer)(localization_map, trained)
         return built
 
@@ -213,8 +214,6 @@ def make_scorer(
         WeightsError: the weights are unusable or of another method.
         MapError: the map lacks what the method needs.
     """
-    from wheretolook.training.weights import method_of_weights
-
     methods = members(name, scorers())
     kinds = [method.weights for method in methods]
     if name not in scorers() and (not kinds or "" in kinds or len({*kinds}) < len(kinds)):
@@ -251,8 +250,6 @@ def build_scorer(method: Method, localization_map: LocalizationMap, options: Bui
 
 def _warn_of_features(of_map: str, weights: Path) -> None:
     """Warn if a map's landmarks have other local features than those the weights were trained on."""
-    from wheretolook.training.weights import read_training
-
     trained_on = read_training(weights).get("features", ["sift"])
     if not of_map or of_map in trained_on:
         return

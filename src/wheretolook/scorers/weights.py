@@ -7,6 +7,9 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from wheretolook.dataset.config import RELEASE
+from wheretolook.geometry.camera import camera_of_record
+from wheretolook.scorers.base import Scorer, same_field_of_view
 from wheretolook.scorers.registry import SUBSTITUTES, BuildOptions, build_scorer, check_method, members, scorers
 from wheretolook.training.weights import method_of_weights, preference, read_training, read_weights
 from wheretolook.utils.errors import ConfigError, WeightsError
@@ -15,7 +18,6 @@ from wheretolook.utils.package import WEIGHTS, or_shipped, shipped
 if TYPE_CHECKING:
     from wheretolook.dataset.layout import Dataset
     from wheretolook.inputs.localization_map import LocalizationMap
-    from wheretolook.scorers.base import Scorer
 
 
 def resolve_weights(
@@ -114,9 +116,6 @@ def _folders(folder: Path, features: str) -> Iterator[Path]:
 
 def _best_for_dataset(dataset: Dataset, kinds: set[str], log: Callable[[str], None]) -> Path | None:
     """Return the preferred file that serves a dataset's cameras, from the first folder that has any."""
-    from wheretolook.dataset.config import RELEASE
-    from wheretolook.geometry.camera import camera_of_record
-    from wheretolook.scorers.base import same_field_of_view
     from wheretolook.training.provenance import was_trained_on
 
     own = dataset.root / "weights"

@@ -34,15 +34,13 @@ from wheretolook.visibility.occlusion import DevicePoints, OcclusionModel, Store
 ROUNDING = 1e-5  # least relative distance of a cell's corners from a plane, since rounding may move landmarks into it
 
 
-MOST_CELLS = 1 << 28  # of all orientations together, a byte each while they are classified
-
-
 def choose_size(n_points: int, n_rotations: int = 1) -> int:
     """Cells along a side of the map, an even number. About six landmarks a cell were fastest on CPU and GPU.
 
     Fewer where the cells of very many orientations would take too much memory.
     """
-    most = min(256, 2 * int(np.sqrt(MOST_CELLS / max(n_rotations, 1)) / 2))
+    # 2^28 cells of all orientations together: a byte each while they are classified
+    most = min(256, 2 * int(np.sqrt((1 << 28) / max(n_rotations, 1)) / 2))
     return int(np.clip(2 * round(np.sqrt(n_points / 6) / 2), 8, max(8, most)))
 
 
@@ -54,37 +52,31 @@ class CellRuns:
     cells: Any  # (n,) pairs of int32: the first cell of a run, and the one after its last
 
 
-@dataclass(frozen=True, eq=False)
-class SphereCells:
-    """The cells of D orientations, on a device."""
+def cells_in_view(camera: Camera, rotations: Float, size: int, device: str) -> tuple[CellRuns, CellRuns]:
+    """Classify the cells, `size` along a side of the map, for rotations (D, 3, 3) cam_from_world, on a Warp device.
 
-    size: int  # cells along a side of the map; there are size * size
-    inside: CellRuns  # runs of cells wholly in view
-    border: CellRuns  # runs of cells that are partly in view, or may be
+    Returns the runs of cells wholly in view, and of those that are partly in view, or may be.
+    """
+    shape = (len(rotations), size * size)
+    classes: Any = wp.empty(shape, dtype=wp.uint8, device=device)
 
-    @classmethod
-    def of(cls, camera: Camera, rotations: Float, size: int, device: str) -> SphereCells:
-        """Classify the cells, `size` along a side, for rotations (D, 3, 3) cam_from_world, on a Warp device."""
-        shape = (len(rotations), size * size)
-        classes: Any = wp.empty(shape, dtype=wp.uint8, device=device)
+    def upload(values: Float, dtype: Any) -> Any:
+        return wp.array(np.asarray(values, dtype=np.float32), dtype=dtype, device=device)
 
-        def upload(values: Float, dtype: Any) -> Any:
-            return wp.array(np.asarray(values, dtype=np.float32), dtype=dtype, device=device)
-
-        if isinstance(camera, ColmapCamera):
-            field = tabulate(camera)
-            centers, radii = cell_centers(size)
-            arrays = [upload(rotations, wp.mat33), upload(centers, wp.vec3), upload(field.depth_rad, wp.float32)]
-            inputs = [*arrays, field.size, float(radii.max()) + ROUNDING]
-            wp.launch(counting_kernel.classify_field_kernel, shape, inputs, [classes], device=device)
-        else:
-            edge = np.arange(size + 1) / size * 2 - 1
-            corners = octahedral_directions(edge[None, :], edge[:, None]).reshape(-1, 3)
-            sides = frustum_sides(camera, rotations)
-            margin = float(ROUNDING * np.linalg.norm(sides, axis=-1).max(initial=0))
-            inputs = [upload(sides, wp.vec3), upload(corners, wp.vec3), size, margin]
-            wp.launch(counting_kernel.classify_pinhole_kernel, shape, inputs, [classes], device=device)
-        return cls(size, *_runs(classes, size))
+    if isinstance(camera, ColmapCamera):
+        field = tabulate(camera)
+        centers, radii = cell_centers(size)
+        arrays = [upload(rotations, wp.mat33), upload(centers, wp.vec3), upload(field.depth_rad, wp.float32)]
+        inputs = [*arrays, field.size, float(radii.max()) + ROUNDING]
+        wp.launch(counting_kernel.classify_field_kernel, shape, inputs, [classes], device=device)
+    else:
+        edge = np.arange(size + 1) / size * 2 - 1
+        corners = octahedral_directions(edge[None, :], edge[:, None]).reshape(-1, 3)
+        sides = frustum_sides(camera, rotations)
+        margin = float(ROUNDING * np.linalg.norm(sides, axis=-1).max(initial=0))
+        inputs = [upload(sides, wp.vec3), upload(corners, wp.vec3), size, margin]
+        wp.launch(counting_kernel.classify_pinhole_kernel, shape, inputs, [classes], device=device)
+    return _runs(classes, size)
 
 
 def _runs(classes: Any, size: int) -> tuple[CellRuns, CellRuns]:
@@ -103,14 +95,10 @@ def _runs(classes: Any, size: int) -> tuple[CellRuns, CellRuns]:
     return CellRuns(starts[: n_rows + 1], cells), CellRuns(starts[n_rows:], cells)
 
 
-GPU_LANES = 16  # threads that share a location and an orientation on a GPU
-UNSURE_BYTES = 20  # of a landmark on the list of those that the table of a field of view cannot decide
-
-
 class FrustumCounter:
     """Counts the landmarks in view from any location, for a fixed set of orientations.
 
-    The landmarks around a location are sorted into cells of the sphere of directions (`SphereCells`). A cell wholly in
+    The landmarks around a location are sorted into cells of the sphere of directions (`cells_in_view`). A cell wholly in
     view counts with all its landmarks; landmarks are tested one by one only in cells on the border of the view.
 
     `rotations` (D, 3, 3) are cam_from_world; `device` is "cpu" or a CUDA device. `n_points`, about how many landmarks
@@ -133,10 +121,11 @@ class FrustumCounter:
         self.rotations = np.asarray(rotations, dtype=np.float32)
         self.device = start_warp(device)
         wp.load_module(counting_kernel, device=self.device)  # only one thread may do that
-        self.lanes = GPU_LANES if wp.get_device(self.device).is_cuda else 1
+        # threads that share a location and an orientation
+        self.lanes = 16 if wp.get_device(self.device).is_cuda else 1
         self._field = tabulate(camera) if isinstance(camera, ColmapCamera) else None
         self.size = size or choose_size(n_points, len(self.rotations))
-        self.cells = SphereCells.of(camera, rotations, self.size, self.device)
+        self.inside, self.border = cells_in_view(camera, rotations, self.size, self.device)
         self._axes: Any = wp.array(self.rotations, dtype=wp.mat33, device=self.device)
         self._near = 0.0
         if isinstance(camera, PinholeCamera):
@@ -201,10 +190,10 @@ class FrustumCounter:
         landmarks.size = self.size
         landmarks.starts = starts
         landmarks.offsets = offsets
-        landmarks.inside_starts = self.cells.inside.starts
-        landmarks.inside = self.cells.inside.cells
-        landmarks.border_starts = self.cells.border.starts
-        landmarks.border = self.cells.border.cells
+        landmarks.inside_starts = self.inside.starts
+        landmarks.inside = self.inside.cells
+        landmarks.border_starts = self.border.starts
+        landmarks.border = self.border.cells
         return landmarks, places
 
     def _count_by_field(self, landmarks: Any, counts: Any) -> Any:
@@ -213,7 +202,7 @@ class FrustumCounter:
         shared = [self._axes, self._depth, self._field.size, landmarks]
         views = counts.flatten()
         n_views = counts.shape[0] * counts.shape[1]
-        capacity = max(1, self.scratch_bytes // UNSURE_BYTES)
+        capacity = max(1, self.scratch_bytes // 20)  # bytes of an entry of both lists
         first = 0
         block = n_views
         number: Any = wp.empty(1, dtype=wp.int32, device=device)
@@ -290,10 +279,6 @@ class FrustumLister(FrustumCounter):
     Views (V, 2) are given by rows of the locations and of the rotations.
     """
 
-    def __init__(self, camera: Camera, rotations: Float, n_points: int, device: str = "cpu", **options: Any) -> None:
-        super().__init__(camera, rotations, n_points, device, **options)
-        wp.load_module(counting_kernel, device=self.device)  # only one thread may do that
-
     def surroundings(self, locations: ArrayLike, points: Any, unoccluded: Any | None) -> Surroundings:
         """What is unoccluded from locations (L, 3) m.
 
@@ -350,10 +335,6 @@ class FrustumLister(FrustumCounter):
         least = wp.float64(MIN_DEPTH_M)
         inputs = [asked, self._axes, self._sides, candidates.sorted, self._rounding, least, write, first]
         wp.launch(counting_kernel.list_kernel, len(views), inputs, outputs, device=self.device)
-
-
-BYTES_TO_RANK = 4  # of every direction at every location, for those who ask which rank it has
-CPU_BLOCK_BYTES = 1 << 24  # on a CPU a block of locations should fit into the cache
 
 
 @dataclass(frozen=True, eq=False)
@@ -452,7 +433,7 @@ def _counter(
 
 def _check_counts(n_locations: int, n_directions: int) -> None:
     """Raise ConfigError if the counts of all views do not fit into memory."""
-    most = fitting(4 + 4 + BYTES_TO_RANK)
+    most = fitting(4 + 4 + 4)  # its count, its place among the best, and its rank for those who ask for it
     if n_locations * n_directions > most:
         problem = f"{n_directions:,} directions at {n_locations:,} locations do not fit into memory"
         raise ConfigError(problem, fix=f"{most // n_locations:,} directions would fit, or fewer locations.")
@@ -470,7 +451,7 @@ def _workers_and_block(
     workers = min(workers, memory_bytes // required)
     share = memory_bytes // workers - counter.fixed_bytes
     if counter.device == "cpu" and not occlusion.uses_all_cores:
-        share = min(share, CPU_BLOCK_BYTES)
+        share = min(share, 1 << 24)  # a block of locations should fit into the cache
     block = min(max(1, share // per_location), counter.max_locations(n_points), -(-n_locations // workers))
     if occlusion.uses_all_cores:
         block = min(block, 16 * cores())  # enough for all cores, and the progress bar moves

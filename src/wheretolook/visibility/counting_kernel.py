@@ -7,15 +7,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from wheretolook.visibility.frustum_kernel import (
-    FAR,
-    cell_of,
-    in_view,
-    inside_sides,
-    least_product,
-    offset_from,
-    rounding_error,
-)
+from wheretolook.visibility.frustum_kernel import FAR, cell_of, in_view, offset_from, surely_in_sides
 
 wp.set_module_options({"enable_backward": False})
 
@@ -159,7 +151,7 @@ def sort_kernel(
 
 @wp.struct
 class SortedLandmarks:
-    """The landmarks of a block of locations sorted into cells, and the cells of each orientation (`SphereCells`)."""
+    """The landmarks of a block of locations sorted into cells, and the cells of each orientation (`cells_in_view`)."""
 
     size: wp.int32  # cells along a side of the sphere's map
     inside_starts: wp.array[wp.int32]  # see `CellRuns`
@@ -229,14 +221,8 @@ def count_kernel(
         entries = entries_of(landmarks, location, landmarks.border[run])
         for entry in range(entries[0] + lane, entries[1], lanes):
             offset = landmarks.offsets[entry]
-            # single precision decides unless the landmark is within its rounding error of a side
-            least = least_product(left, right, top, bottom, offset)
-            error = rounding_error(offset, rounding)
-            if least > error:
+            if surely_in_sides(left, right, top, bottom, offset, rounding):
                 count += 1
-            elif least >= -error:  # noqa: SIM102 (Warp evaluates both sides of an `and`)
-                if inside_sides(left, right, top, bottom, offset):
-                    count += 1
     near = near_entries(landmarks, location)
     for entry in range(near[0] + lane, near[1], lanes):
         if in_view(sides, orientation, landmarks.offsets[entry], min_depth):
@@ -338,6 +324,31 @@ def image_of(rotation: wp.mat33, offset: wp.vec3) -> wp.vec2:
     return wp.vec2(there[0] / there[2], there[1] / there[2])
 
 
+@wp.func
+def list_inside(
+    landmarks: SortedLandmarks,
+    location: wp.int32,
+    orientation: wp.int32,
+    rotation: wp.mat33,
+    write: wp.bool,
+    begin: wp.int64,
+    entries: wp.array[wp.int32],
+    image: wp.array[wp.vec2],
+) -> wp.int64:
+    """Count, and with `write` list from `begin` on, the landmarks of cells that are wholly in view."""
+    number = wp.int64(0)
+    runs = inside_runs(landmarks, orientation)
+    for run in range(runs[0], runs[1]):
+        span = entries_of(landmarks, location, landmarks.inside[run])
+        if write:
+            for entry in range(span[0], span[1]):
+                at = begin + number + wp.int64(entry - span[0])
+                entries[at] = entry
+                image[at] = image_of(rotation, landmarks.offsets[entry])
+        number += wp.int64(span[1] - span[0])
+    return number
+
+
 @wp.kernel
 def list_kernel(
     views: wp.array[wp.vec2i],
@@ -359,20 +370,11 @@ def list_kernel(
     view = wp.tid()
     location = views[view][0]
     orientation = views[view][1]
-    number = wp.int64(0)
     begin = wp.int64(0)
     if write:
         begin = first[view]
     rotation = rotations[orientation]
-    runs = inside_runs(landmarks, orientation)
-    for run in range(runs[0], runs[1]):
-        span = entries_of(landmarks, location, landmarks.inside[run])
-        if write:
-            for entry in range(span[0], span[1]):
-                at = begin + number + wp.int64(entry - span[0])
-                entries[at] = entry
-                image[at] = image_of(rotation, landmarks.offsets[entry])
-        number += wp.int64(span[1] - span[0])
+    number = list_inside(landmarks, location, orientation, rotation, write, begin, entries, image)
     left = sides[orientation, 0]
     right = sides[orientation, 1]
     top = sides[orientation, 2]
@@ -382,12 +384,7 @@ def list_kernel(
         span = entries_of(landmarks, location, landmarks.border[run])
         for entry in range(span[0], span[1]):
             offset = landmarks.offsets[entry]
-            least = least_product(left, right, top, bottom, offset)
-            error = rounding_error(offset, rounding)
-            seen = least > error
-            if not seen and least >= -error:
-                seen = inside_sides(left, right, top, bottom, offset)
-            if seen:
+            if surely_in_sides(left, right, top, bottom, offset, rounding):
                 if write:
                     entries[begin + number] = entry
                     image[begin + number] = image_of(rotation, offset)
@@ -419,20 +416,11 @@ def list_field_kernel(
     view = wp.tid()
     location = views[view][0]
     orientation = views[view][1]
-    number = wp.int64(0)
     begin = wp.int64(0)
     if write:
         begin = first[view]
     rotation = rotations[orientation]
-    runs = inside_runs(landmarks, orientation)
-    for run in range(runs[0], runs[1]):
-        span = entries_of(landmarks, location, landmarks.inside[run])
-        if write:
-            for entry in range(span[0], span[1]):
-                at = begin + number + wp.int64(entry - span[0])
-                entries[at] = entry
-                image[at] = image_of(rotation, landmarks.offsets[entry])
-        number += wp.int64(span[1] - span[0])
+    number = list_inside(landmarks, location, orientation, rotation, write, begin, entries, image)
     runs = border_runs(landmarks, orientation)
     for run in range(runs[0], runs[1]):
         span = entries_of(landmarks, location, landmarks.border[run])

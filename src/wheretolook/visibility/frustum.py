@@ -21,15 +21,6 @@ from wheretolook.utils.processes import cores
 from wheretolook.utils.warp import start_warp
 from wheretolook.visibility import frustum_kernel
 
-COARSEST_SIZE = 256  # cells along the first table's side, and of a cell's side in the next
-REFINEMENT = 4
-TABLE_SIZE = 1024  # cells along a side of the table: 0.06 to 0.19 degrees from a cell's centre to its farthest corner
-MAX_DEPTH_RAD = 0.25  # larger depths are clipped to this; few cells of the sphere need more
-
-EDGE_SAMPLES = 2048  # pixels sampled along each edge of the image, and each side of a grid over it
-GRID_SAMPLES = 512
-BISECTIONS = 20  # of the gap between neighbouring centres on either side of the border, which is found to 1e-8 rad
-
 
 @dataclass(frozen=True, eq=False)
 class FieldOfView:
@@ -47,17 +38,19 @@ class FieldOfView:
 
 
 @lru_cache(maxsize=8)
-def tabulate(camera: ColmapCamera, size: int = TABLE_SIZE) -> FieldOfView:
+def tabulate(camera: ColmapCamera, size: int = 1024) -> FieldOfView:
     """The table of a camera, which takes half a second. The latest are kept.
+
+    With 1024 cells along a side, it is 0.06 to 0.19 degrees from a cell's centre to its farthest corner.
 
     A large table is made from one with fewer cells: what is certain of a cell there is certain of its parts, and only
     the parts of the others are examined.
     """
     centers, radii = cell_centers(size)
     depth = np.zeros(size * size, dtype=np.float32)
-    if size % REFINEMENT == 0 and size // REFINEMENT >= COARSEST_SIZE:
-        coarse = tabulate(camera, size // REFINEMENT).depth_rad.reshape((size // REFINEMENT,) * 2)
-        depth = coarse.repeat(REFINEMENT, axis=0).repeat(REFINEMENT, axis=1).reshape(-1)
+    if size % 4 == 0 and size >= 1024:
+        coarse = tabulate(camera, size // 4).depth_rad.reshape(size // 4, size // 4)
+        depth = coarse.repeat(4, axis=0).repeat(4, axis=1).reshape(-1)
     cells = np.flatnonzero(depth == 0)  # of which nothing is known yet
     seen = depth > 0
     seen[cells] = camera.sees(centers[cells])
@@ -73,10 +66,11 @@ def tabulate(camera: ColmapCamera, size: int = TABLE_SIZE) -> FieldOfView:
         between_centers = between_centers[chord > 4 * radii.max()]
     border = np.concatenate([border, between_centers])
     sign = np.where(seen[cells], 1.0, -1.0)
+    most_rad = 0.25  # larger depths are clipped to this; few cells of the sphere need more
     if len(border) == 0:
-        depth[cells] = sign * MAX_DEPTH_RAD
+        depth[cells] = sign * most_rad
         return FieldOfView(size, depth)
-    reach = 2 * np.sin(MAX_DEPTH_RAD / 2)
+    reach = 2 * np.sin(most_rad / 2)
     chord, _ = cKDTree(border).query(centers[cells], distance_upper_bound=reach, workers=-1)
     angle = 2 * np.arcsin(np.minimum(chord, reach) / 2)
     # Every point of a cell is within the cell's radius of its centre. Points found on the border are at most a cell apart, so the border
@@ -101,21 +95,22 @@ def _neighbours(cells: NDArray[np.int64], size: int) -> tuple[NDArray[np.int64],
 
 def _rays_of_image(camera: ColmapCamera) -> tuple[Float, NDArray[np.bool_]]:
     """Unit rays (n, 3) that the camera sees through a grid of pixels and the image's edge, and which lie on it."""
-    side = np.linspace(1e-9, 1 - 1e-9, EDGE_SAMPLES)
-    coarse = side[:: EDGE_SAMPLES // GRID_SAMPLES]
+    n = 2048  # pixels along each edge of the image; a fourth along each side of the grid
+    side = np.linspace(1e-9, 1 - 1e-9, n)
+    coarse = side[::4]
     x, y = (part.ravel() for part in np.meshgrid(coarse, coarse))
-    ends = np.full(EDGE_SAMPLES, side[0]), np.full(EDGE_SAMPLES, side[-1])
+    ends = np.full(n, side[0]), np.full(n, side[-1])
     x = np.concatenate([x, side, side, *ends]) * camera.width
     y = np.concatenate([y, *ends, side, side]) * camera.height
     rays = camera.unproject(np.column_stack([x, y]))
-    on_edge = np.arange(len(rays)) >= len(rays) - 4 * EDGE_SAMPLES
+    on_edge = np.arange(len(rays)) >= len(rays) - 4 * n
     seen = camera.sees(rays)
     return rays[seen], on_edge[seen]
 
 
 def _border_between(camera: ColmapCamera, seen: Float, unseen: Float) -> Float:
     """Points (n, 3) on the border of the field of view between unit directions (n, 3) in and out of view."""
-    for _ in range(BISECTIONS):
+    for _ in range(20):  # of the gap between neighbouring centres: to 1e-8 rad
         middle = seen + unseen
         middle /= np.linalg.norm(middle, axis=1, keepdims=True)
         is_seen = camera.sees(middle)[:, None]
@@ -163,7 +158,6 @@ MIN_DEPTH_M = 2.0**-10  # a pinhole sees nothing nearer to its image plane than 
 
 CANDIDATES_AT_ONCE = 1 << 20  # landmarks that a thread of a CPU tests for several views at a time
 OFFSETS_AT_ONCE = 1 << 18  # landmarks that a COLMAP camera projects at a time
-SINGLE_ROUNDING = 5e-7  # bound on the relative error of a product of two vectors of three float32: 3 * 2^-24, and room
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,7 +214,8 @@ def frustum_sides(camera: PinholeCamera, rotations: ArrayLike) -> NDArray[np.flo
 
 def sides_rounding(sides: NDArray[np.float32]) -> float:
     """Bound on the relative rounding error of single-precision products with the normals of `frustum_sides`."""
-    return float(SINGLE_ROUNDING * np.linalg.norm(sides[:, :4], axis=-1).max(initial=0))
+    # a product of two vectors of three float32 is off by 3 * 2^-24 at most, and room
+    return float(5e-7 * np.linalg.norm(sides[:, :4], axis=-1).max(initial=0))
 
 
 def near_radius_m(camera: PinholeCamera) -> float:

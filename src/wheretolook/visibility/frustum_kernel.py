@@ -79,6 +79,19 @@ def rounding_error(offset: wp.vec3, rounding: wp.float32) -> wp.float32:
 
 
 @wp.func
+def surely_in_sides(
+    left: wp.vec3, right: wp.vec3, top: wp.vec3, bottom: wp.vec3, offset: wp.vec3, rounding: wp.float32
+) -> wp.bool:
+    """As `inside_sides`; single precision decides unless the landmark is within its rounding error of a side."""
+    least = least_product(left, right, top, bottom, offset)
+    error = rounding_error(offset, rounding)
+    inside = least > error
+    if not inside and least >= -error:
+        inside = inside_sides(left, right, top, bottom, offset)
+    return inside
+
+
+@wp.func
 def pixel_of(axes: wp.mat33, offset: wp.vec3, focal: wp.vec2d, center: wp.vec2d) -> wp.vec2d:
     """Pixel coordinates, of focal lengths and principal point in pixels.
 

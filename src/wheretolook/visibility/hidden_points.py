@@ -13,15 +13,11 @@ from wheretolook.geometry.poses import Float
 from wheretolook.utils.devices import in_threads
 from wheretolook.utils.errors import MapError, SceneError, check_range
 from wheretolook.utils.processes import cores
-from wheretolook.visibility.config import DEFAULT_RADIUS
+from wheretolook.visibility.config import OcclusionConfig
 from wheretolook.visibility.frustum import cells_of, octahedral_directions
 from wheretolook.visibility.occlusion import OcclusionInputs, OcclusionModel
 
 LEAST_POINTS = 50_000  # of fewer, the hull of all takes no longer
-_POINTS_IN_CELL = 8.0  # on average, with which it was fastest
-_MOST_CELLS = 512  # along a side of the map
-_ROUNDING = 1e-7  # by which, of a length, the hull may lie lower than computed here
-_FLAT_HULL = 1e-12  # least volume that a facet's corners and the origin span
 _NO_LENGTH = 1e-12  # keeps facets through the origin, which no direction leaves by, from dividing by zero
 
 
@@ -33,7 +29,7 @@ def may_be_near_hull(directions: Float, lengths: Float, margin: float) -> NDArra
     every = np.ones(len(lengths), dtype=bool)
     if len(lengths) < LEAST_POINTS:
         return every
-    size = 2 * min(_MOST_CELLS // 2, round(np.sqrt(len(lengths) / _POINTS_IN_CELL) / 2))
+    size = 2 * min(256, round(np.sqrt(len(lengths) / 8) / 2))  # 8 points in a cell were fastest
     cells = cells_of(directions, size)
     farthest = np.zeros(size**2)
     np.maximum.at(farthest, cells, lengths)
@@ -42,7 +38,8 @@ def may_be_near_hull(directions: Float, lengths: Float, margin: float) -> NDArra
         hull = ConvexHull(np.concatenate([directions[chosen] * lengths[chosen, None], np.zeros((1, 3))]))
     except QhullError:  # the chosen ones lie in a plane
         return every
-    return lengths + margin >= (_least_lengths(hull, size) * (1 - _ROUNDING))[cells]
+    # by rounding, the hull may lie lower than computed here
+    return lengths + margin >= (_least_lengths(hull, size) * (1 - 1e-7))[cells]
 
 
 def _least_lengths(hull: ConvexHull, size: int) -> Float:
@@ -72,7 +69,7 @@ def _lengths_for_sure(hull: ConvexHull, directions: Float) -> Float:
     a, b, c = np.moveaxis(hull.points[hull.simplices[facet]], 1, 0)
     sides = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=1)
     volume = (a * sides[:, 0]).sum(-1)
-    volume[np.abs(volume) < _FLAT_HULL] = np.inf
+    volume[np.abs(volume) < 1e-12] = np.inf
     shares = np.einsum("nij,nj->ni", sides, directions) / volume[:, None]
     total = shares.sum(1)
     return np.where((shares >= -1e-9).all(1) & (total > 0.5), 1 / np.maximum(total, 0.5), 0.0)
@@ -113,13 +110,6 @@ def leaving_facets(hull: ConvexHull, directions: Float) -> tuple[NDArray[np.int6
     return facet, value
 
 
-TOUCHING_M = 1e-6  # a landmark this close to a location is in the same place, and has no direction as seen from it
-_FLAT = 1e-12  # least mean square of the directions along an axis; below it, all lie in the plane across that axis
-
-
-_LOCK = Lock()
-
-
 @dataclass(frozen=True, eq=False)
 class _Places:
     """Distinct positions of a map's landmarks; computing them takes seconds for two million, so they are reused."""
@@ -156,8 +146,9 @@ class HiddenPointRemoval(OcclusionModel):
 
     name = "hidden-points"
     uses_all_cores = True
+    _lock = Lock()  # so that threads that ask about the same landmarks do not all sort them
 
-    def __init__(self, radius: float = DEFAULT_RADIUS, margin_m: float = 0.05, threads: int = 0) -> None:
+    def __init__(self, radius: float = OcclusionConfig.radius, margin_m: float = 0.05, threads: int = 0) -> None:
         check_range("radius", radius, 1)
         check_range("margin_m", margin_m, 0)
         check_range("threads", threads, 0)
@@ -197,14 +188,14 @@ class HiddenPointRemoval(OcclusionModel):
         if len(bad):
             raise MapError(f"{len(bad)} landmarks are not finite", value=points[bad[0]].tolist())
         tree = self._places_of(np.asarray(points, dtype=np.float64)).tree
-        distance, _ = tree.query(locations, distance_upper_bound=2 * TOUCHING_M)
-        touching = np.asarray(locations)[distance <= TOUCHING_M]
+        distance, _ = tree.query(locations, distance_upper_bound=2e-6)
+        touching = np.asarray(locations)[distance <= 1e-6]  # metres: such a landmark has no direction
         if len(touching):
             problem = "a landmark is at the location, which is on a surface or inside geometry"
             raise SceneError(problem, value=touching[0].tolist(), fix="Choose locations in free space.")
 
     def _places_of(self, points: Float) -> _Places:
-        with _LOCK:  # so that threads that ask about the same landmarks do not all sort them
+        with self._lock:
             if self._places is None or not np.array_equal(self._places.points, points):
                 self._places = _Places.of(points)
             return self._places
@@ -246,5 +237,5 @@ def _missing_axes(directions: Float) -> Float:
     With them the hull has three dimensions, as Qhull needs; its section with the plane or line stays the same.
     """
     spread, axes = np.linalg.eigh(directions.T @ directions)
-    across = axes[:, spread <= _FLAT * len(directions)].T
+    across = axes[:, spread <= 1e-12 * len(directions)].T  # of the mean square along an axis
     return np.concatenate([across, -across])

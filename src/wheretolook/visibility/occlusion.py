@@ -27,11 +27,6 @@ if TYPE_CHECKING:
     from wheretolook.visibility.config import OcclusionConfig
 
 
-MORTON_BITS = 10  # bits along each axis of the curve that landmarks are ordered by
-MATCH_M = 1e-4  # locations closer than this are taken for the same stored location
-ON_SURFACE_M = 1e-3  # a location this close to a triangle is on it
-
-
 class DevicePoints:
     """Landmarks (N, 3) m on a device along a Morton curve, so that threads side by side have landmarks side by side.
 
@@ -71,8 +66,8 @@ def morton_codes(positions: NDArray[np.float64]) -> NDArray[np.int64]:
     low = positions[finite].min(0) / 2  # halves: their difference is finite
     high = positions[finite].max(0) / 2
     share = (positions[finite] / 2 - low) / np.maximum(high - low, 1e-12)
-    cells = (share * ((1 << MORTON_BITS) - 1)).astype(np.int64)
-    for bit in range(MORTON_BITS):
+    cells = (share * 1023).astype(np.int64)
+    for bit in range(10):
         for axis in range(3):
             codes[finite] |= ((cells[:, axis] >> bit) & 1) << (3 * bit + axis)
     return codes
@@ -185,9 +180,9 @@ class MeshOcclusion(OcclusionModel):
         return self.raycaster.unoccluded_on_device(locations, points.single(self.raycaster.origin), self.margin_m)
 
     def inside_geometry(self, locations: Float) -> NDArray[np.bool_]:
-        """Whether locations (L, 3) m are on a surface or, in a one-sided mesh, surrounded mostly by backs; (L,)."""
+        """Whether locations (L, 3) m are on a surface, within 1 mm, or, in a one-sided mesh, surrounded mostly by backs; (L,)."""
         at = np.asarray(locations, dtype=np.float64).reshape(-1, 3)
-        inside = self.raycaster.distance_to_surface(at, ON_SURFACE_M) <= ON_SURFACE_M
+        inside = self.raycaster.distance_to_surface(at, 1e-3) <= 1e-3
         if not self.two_sided:
             _, backs = self._sides_seen(at)
             inside |= backs.mean(1) > 0.5
@@ -227,14 +222,14 @@ class StoredOcclusion(OcclusionModel):
         return self._unpack(slice(None))
 
     def unoccluded(self, locations: Float, points: Float) -> NDArray[np.bool_]:
-        """Rows (L, N) of the stored mask.
+        """Rows (L, N) of the stored mask, of locations to 0.1 mm.
 
         Raises a TableError if a location was not stored, or the mask is of another number of landmarks.
         """
         if len(points) != self.n_landmarks:
             problem = f"stored occlusion is of {self.n_landmarks} landmarks, the map has {len(points)}"
             raise TableError(problem, fix="Run the sample stage again.")
-        distance, row = self._tree.query(locations, distance_upper_bound=MATCH_M)
+        distance, row = self._tree.query(locations, distance_upper_bound=1e-4)
         unknown = np.asarray(locations)[~np.isfinite(distance)]
         if len(unknown):
             fix = "Use a mesh for free locations, or sample this location first."
@@ -260,14 +255,11 @@ class StoredOcclusion(OcclusionModel):
             raise TableError(f"cannot read stored occlusion: {error}", path=path, fix=fix) from error
 
 
-DECIMALS = 5  # locations that agree to this many decimals of a metre are one
-
-
 class CachedOcclusion(OcclusionModel):
     """Caches the masks of another model, one bit for each line of sight.
 
     Hidden-point removal takes a tenth of a second for a location, and is evaluated several times: for the scores of all
-    directions, for those of the best views, and for their visible landmarks. When `max_bytes` are exceeded the cache is
+    directions, for those of the best views, and for their visible landmarks. Locations are rounded to 0.01 mm. When `max_bytes` are exceeded the cache is
     cleared. Not safe for several threads with the same location.
     """
 
@@ -282,7 +274,7 @@ class CachedOcclusion(OcclusionModel):
         """Mask (L, N) of the model, from the cache where possible."""
         at = np.asarray(locations, dtype=np.float64).reshape(-1, 3)
         of_points = len(points), float(np.sum(points))  # differ between sets of landmarks
-        keys = [(*of_points, *key) for key in (np.round(at, DECIMALS) + 0.0).tolist()]
+        keys = [(*of_points, *key) for key in (np.round(at, 5) + 0.0).tolist()]
         new = [row for row, key in enumerate(keys) if key not in self._known]
         mask = np.empty((len(at), len(points)), dtype=bool)
         if new:

@@ -7,14 +7,13 @@ from numpy.typing import ArrayLike
 
 from wheretolook.geometry.poses import Float
 from wheretolook.utils.errors import MapError
-from wheretolook_paper.benchmark.folder import CAMERA
+from wheretolook_paper.benchmark.files import CAMERA
 
 ACTLOC = "max-visibility-shipped"
 ACTLOC_FIXED = "max-visibility"
 
 MAX_ERROR_PX = 0.5  # of counted landmarks
 MAX_DEPTH_M = 3.0
-_REACH_M = 4.0  # farther landmarks are outside the image or deeper than that
 _ELEVATIONS = np.arange(-60, 60, 20)
 _AZIMUTHS = np.arange(-180, 180, 20)
 
@@ -37,7 +36,7 @@ def actloc_views(points: ArrayLike, waypoints: ArrayLike) -> Float:
     poses = np.empty((len(centers), 3, 4))
     for row, center in enumerate(centers):
         rays = landmarks - center
-        rays = rays[np.linalg.norm(rays, axis=1) < _REACH_M]
+        rays = rays[np.linalg.norm(rays, axis=1) < 4.0]  # farther landmarks are outside the image or deeper than that
         elevation, azimuth = angles[int(np.argmax([_count(rays @ rotation) for rotation in world_from_cam]))]
         rotation = orientation(elevation, azimuth).T  # exchanged, as in its code
         poses[row] = np.column_stack([rotation, -rotation @ center])

@@ -94,8 +94,7 @@ class Benchmark(Command):
     def run(self) -> None:
         """Run the benchmark, or score files, and write the report to `out`."""
         from wheretolook_paper.benchmark.files import read_errors, read_poses
-        from wheretolook_paper.benchmark.report import NOTES, SUMMARY_CSV, VIEWS_CSV, Result, write_report
-        from wheretolook_paper.benchmark.scores import Scores
+        from wheretolook_paper.benchmark.report import NOTES, SUMMARY_CSV, VIEWS_CSV, Result, Scores, write_report
 
         if self.errors is not None and self.poses is not None:
             scores = Scores.of(read_poses(self.poses), read_errors(self.errors))
@@ -112,7 +111,7 @@ class Benchmark(Command):
         from wheretolook.scorers.registry import check_method
         from wheretolook.utils.devices import usable_device
         from wheretolook_paper.benchmark.actloc_baseline import ACTLOC
-        from wheretolook_paper.benchmark.folder import BenchmarkScene
+        from wheretolook_paper.benchmark.files import BenchmarkScene
         from wheretolook_paper.benchmark.report import Result
         from wheretolook_paper.benchmark.round import BEST, RoundConfig, SceneRound
 

@@ -7,27 +7,53 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
+from wheretolook.geometry.camera import PinholeCamera, cameras_by_id
 from wheretolook.geometry.lattices import Lattice
+from wheretolook.geometry.mesh import TexturedMesh
 from wheretolook.geometry.poses import Float, pose_error
-from wheretolook.localization.config import LocalizerConfig
+from wheretolook.localization.config import LocalizerConfig, versions
+from wheretolook.localization.localizer import Localizer
+from wheretolook.mapping.colmap_model import MODEL_FILES, colmap_poses, model_arrays, read_model
+from wheretolook.mapping.config import PARTNERS, MapConfig
+from wheretolook.mapping.landmarks import Landmarks
+from wheretolook.mapping.map_folder import DATABASE_FILE, LANDMARKS_FILE, MapDraft, MapRun, finish_map
+from wheretolook.mapping.triangulation import (
+    choose_pairs,
+    extract_with_colors,
+    posed_model,
+    shrink_depth,
+    surface_overlap,
+    triangulate_model,
+)
+from wheretolook.rendering.raycasting import MeshRaycaster
+from wheretolook.rendering.warp_renderer import Renderer, WarpRenderer
+from wheretolook.scenes.loading import load_mesh
+from wheretolook.scorers.weights import resolve_weights
 from wheretolook.select.waypoints import Waypoints, read_waypoints
+from wheretolook.select.where_to_look import WhereToLook
 from wheretolook.utils.errors import MapError, SceneError, StorageError, TableError
-from wheretolook.utils.files import ArtifactCache, atomic_folder, cache_key, fingerprint, write_bytes
+from wheretolook.utils.files import ArtifactCache, atomic_folder, cache_key, fingerprint, read_image, write_bytes
 from wheretolook.utils.package import VERSION
+from wheretolook.utils.processes import WorkerPool
 from wheretolook_paper.benchmark.actloc_baseline import ACTLOC, ACTLOC_FIXED, MAX_ERROR_PX, actloc_views
-from wheretolook_paper.benchmark.files import IMAGE_ENDING, PoseFile, read_errors, read_poses, write_errors, write_poses
-from wheretolook_paper.benchmark.folder import CAMERA, DRAWN_CAMERA, BenchmarkScene
-from wheretolook_paper.benchmark.scores import Scores
-
-if TYPE_CHECKING:
-    from wheretolook.geometry.mesh import TexturedMesh
-    from wheretolook.localization.localizer import Localizer
-    from wheretolook.rendering.warp_renderer import Renderer
+from wheretolook_paper.benchmark.files import (
+    CAMERA,
+    DRAWN_CAMERA,
+    IMAGE_ENDING,
+    BenchmarkScene,
+    PoseFile,
+    read_errors,
+    read_poses,
+    write_errors,
+    write_poses,
+)
+from wheretolook_paper.benchmark.report import Scores
 
 POSES = "selected_gt_poses.txt"
 IMAGES = "images"
@@ -40,7 +66,6 @@ MAP_FOLDER = "map"
 CACHE = "made-from.json"
 STEPS = ("select", "localize")
 BATCH = 16  # images rendered, or localized, at a time
-MAX_OFFSET_M = 0.25  # median distance of landmarks from the mesh above which their frames differ
 LOCALIZER = LocalizerConfig(max_error_px=12.0)  # RANSAC's threshold in match_and_localize.py
 
 
@@ -120,7 +145,6 @@ class SceneRound:
         return read_poses(path)
 
     def _selection_key(self, method: str) -> str:
-        from wheretolook.scorers.weights import resolve_weights
 
         config = self.config
         parts: list[Any] = [VERSION, self._model_key, fingerprint(self.scene.mesh), fingerprint(self.scene.waypoints)]
@@ -131,14 +155,12 @@ class SceneRound:
         return cache_key("select", method, *parts)
 
     def _actloc_selection(self) -> tuple[Sequence[str], Float]:
-        from wheretolook.mapping.colmap_model import model_arrays, read_model
 
         arrays = model_arrays(read_model(self.scene.model))
         self._check_frame(arrays.points)
         return self.waypoints.ids, actloc_views(arrays.points[arrays.errors_px < MAX_ERROR_PX], self.waypoints.points)
 
     def _selection(self, method: str) -> tuple[Sequence[str], Float]:
-        from wheretolook.select.where_to_look import WhereToLook
 
         config = self.config
         baseline = method == ACTLOC_FIXED
@@ -163,13 +185,11 @@ class SceneRound:
 
     def _check_frame(self, points: Float) -> None:
         """Raise a SceneError if most landmarks (N, 3) m are far from the mesh."""
-        from wheretolook.rendering.raycasting import MeshRaycaster
-
         low, high = self._mesh.bounds
         some = points[:: max(1, len(points) // 2000)]
         max_distance_m = float(np.linalg.norm(high - low) + np.abs(some - low).max())
         offset_m = float(np.median(MeshRaycaster(self._mesh).distance_to_surface(some, max_distance_m)))
-        if not offset_m <= MAX_OFFSET_M:
+        if not offset_m <= 0.25:  # median distance of landmarks from the mesh above which their frames differ
             problem = f"mesh and map have different frames: half of the landmarks are {offset_m:.3g} m from the mesh"
             raise SceneError(problem, path=self.scene.mesh, fix="Give the mesh in the frame of the map: --mesh FILE.")
 
@@ -225,8 +245,6 @@ class SceneRound:
 
     def _estimates(self, files: list[Path]) -> list[Float | None]:
         """Return the estimated poses (3, 4) of images; like the benchmark, any pose counts."""
-        from wheretolook_paper.benchmark.query_map import read_rgb
-
         images = []
         for path in files:
             image = read_rgb(path)
@@ -249,10 +267,6 @@ class SceneRound:
 
     @cached_property
     def _localizer(self) -> Localizer:
-        from wheretolook.localization.localizer import Localizer
-        from wheretolook.mapping.landmarks import Landmarks
-        from wheretolook.mapping.map_folder import LANDMARKS_FILE
-        from wheretolook_paper.benchmark.query_map import build_query_map
 
         folder = self.folder / MAP_FOLDER
         device = self.config.device
@@ -264,26 +278,22 @@ class SceneRound:
 
     @cached_property
     def _mesh(self) -> TexturedMesh:
-        from wheretolook.scenes.loading import load_mesh
 
         return load_mesh(self.scene.mesh)
 
     @cached_property
     def _renderer(self) -> Renderer:
-        from wheretolook.rendering.warp_renderer import WarpRenderer
 
         return WarpRenderer(self._mesh, self.config.device)
 
     @cached_property
     def _model_key(self) -> str:
-        from wheretolook.mapping.colmap_model import MODEL_FILES
 
         paths = [self.scene.model / (name + suffix) for name in MODEL_FILES for suffix in (".bin", ".txt")]
         return cache_key("model", [(path.name, fingerprint(path)) for path in paths if path.is_file()])
 
     @cached_property
     def _map_key(self) -> str:
-        from wheretolook.localization.config import versions
 
         return cache_key("map", self._model_key, fingerprint(self.scene.mesh), versions())
 
@@ -300,3 +310,56 @@ def _checked(waypoints: Waypoints) -> Waypoints:
             fix = "Use numbers or letters, each once, because ids name images."
             raise TableError("an id cannot name a file", path=waypoints.path, value=waypoints.where(row), fix=fix)
     return waypoints
+
+
+_FIX = "Localize with the benchmark's own script instead: --localizer none."
+_RENDER_BATCH = 16
+
+
+def build_query_map(scene: BenchmarkScene, renderer: Renderer, folder: Path, workers: int, device: str) -> None:
+    """Triangulate SIFT landmarks and save them with descriptors in an existing folder.
+
+    The released maps have SuperPoint keypoints, whose descriptors need SuperPoint's network; here SIFT is extracted
+    from the same images, and the poses are kept. Image pairs are chosen by the overlap of their surface in the mesh.
+
+    Raises a MapError if the images are missing or of another size than the map's camera, the map has several cameras or
+    a camera with distortion, or nothing can be triangulated.
+    """
+    config = MapConfig()
+    model = read_model(scene.model)
+    camera, *others = {*cameras_by_id(model.cameras, scene.model).values()}
+    if others or not isinstance(camera, PinholeCamera):
+        raise MapError("the benchmark's maps have one pinhole camera", path=scene.model, fix=_FIX)
+    poses = colmap_poses(scene.model, model)
+    names = [model.images[number].name for number in sorted(model.images) if model.images[number].has_pose]
+    files = [scene.image_file(name) for name in names]
+    depth: list[NDArray[np.float32]] = []
+    for start in range(0, len(poses), _RENDER_BATCH):
+        depth.extend(shrink_depth(renderer.render(DRAWN_CAMERA, poses[start : start + _RENDER_BATCH]).depth_m))
+    pairs = choose_pairs(surface_overlap(DRAWN_CAMERA, poses, np.stack(depth)), PARTNERS)
+    with WorkerPool(workers) as processes:
+        run = MapRun(config, processes, device=device)
+        images = (_read(path, camera) for path in files)
+        stored, colors = zip(*extract_with_colors(images, len(files), "map: extract", run), strict=True)
+        database = folder / DATABASE_FILE
+        built = triangulate_model(database, posed_model(camera, poses), stored, colors, pairs, run)
+        finish_map(MapDraft(built, scene.images, config.max_reprojection_error_px, _FIX, database), folder, run)
+
+
+def _read(path: Path, camera: PinholeCamera) -> NDArray[np.uint8]:
+    """Read an image (H, W, 3), RGB, of a camera."""
+    image = read_rgb(path)
+    if image is None or image.shape[:2] != (camera.height, camera.width):
+        problem = f"not an image of {camera.width}x{camera.height} px, the size of the map's camera"
+        raise MapError(problem, path=path, fix="Copy the original file.")
+    return image
+
+
+def read_rgb(path: Path) -> NDArray[np.uint8] | None:
+    """Read an image (H, W, 3) uint8, RGB; None if it is missing or unreadable."""
+    import cv2
+
+    try:
+        return np.asarray(read_image(path, cv2.IMREAD_COLOR)[:, :, ::-1], dtype=np.uint8)
+    except (OSError, ValueError):
+        return None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, ClassVar
@@ -17,7 +18,7 @@ from wheretolook.commands.options import (
     open_scene,
 )
 from wheretolook.dataset.dataset_lock import reading
-from wheretolook.dataset.layout import Dataset
+from wheretolook.dataset.layout import Dataset, SceneFolder
 from wheretolook.tracking import TrackingConfig, check_store, kept_if_not_logged
 from wheretolook.utils.errors import ConfigError, SceneError
 from wheretolook.utils.files import atomic_write, write_text
@@ -87,23 +88,32 @@ class ComparePaths(SceneOptions, LabelOptions):
         return summary
 
 
+def scenes_with_meshes(dataset: Dataset, names: Sequence[str]) -> list[SceneFolder]:
+    """Return the scenes of these names, by default the test scenes.
+
+    Raises ConfigError if there is none, SceneError if one has no mesh.
+    """
+    scenes = [dataset.scene(name) for name in names] or list(dataset.split("test"))
+    if not scenes:
+        raise ConfigError("the dataset has no test scene", path=dataset.root, fix="Name scenes: --in-scenes.")
+    for scene in scenes:
+        if not scene.mesh.is_file():
+            raise SceneError("rendering needs a mesh", path=scene.folder, fix="Choose other scenes.")
+    return scenes
+
+
 def _comparisons(options: ComparePaths, dataset: Dataset, log: Log) -> list[SceneComparison]:
     from wheretolook.localization.shard import SceneJob
     from wheretolook.scorers.weights import resolve_weights
     from wheretolook_paper.paths.scene_comparison import SceneComparison
 
     config = options.paths
-    scenes = [dataset.scene(name) for name in config.in_scenes] or list(dataset.split("test"))
-    if not scenes:
-        raise ConfigError("the dataset has no test scene", path=dataset.root, fix="Name scenes: --in-scenes.")
-    for files in scenes:
-        if not files.mesh.is_file():
-            raise SceneError("rendering needs a mesh", path=files.folder, fix="Choose other scenes.")
+    scenes = scenes_with_meshes(dataset, config.in_scenes)
     weights = {name: resolve_weights(name, config.weights, dataset=dataset, log=log) for name in config.methods}
     comparisons = []
     for files in scenes:
         scene = open_scene(options, files)
-        extractor = extractor_of(files, options.mapping.extractor)
+        extractor = extractor_of(files, options.extractor)
         label = options.label
         made_from = files.mesh, files.landmarks, scene.camera, label.localizer, extractor, scene.device
         job = SceneJob(*made_from, appearance=label.appearance)

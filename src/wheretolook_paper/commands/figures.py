@@ -3,16 +3,36 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
 from wheretolook.commands.options import DatasetOptions, Log
 from wheretolook.dataset.dataset_lock import reads_dataset
+from wheretolook.figures import KINDS
 from wheretolook.tracking import TrackingConfig
-from wheretolook.utils.errors import MissingRunError
-from wheretolook_paper.figures.config import FiguresConfig
+from wheretolook.utils.errors import ConfigError, MissingRunError
 
 if TYPE_CHECKING:
     from wheretolook.dataset.layout import Dataset
+
+
+@dataclass(frozen=True)
+class FiguresConfig:
+    """Options of the figures stage.
+
+    Args:
+        out: output folder; `<dataset>/results/figures` by default.
+        only: names of the figures and tables to draw, as listed by `wheretolook figures --list`; all by default.
+        kinds: file formats of figures: png, pdf, svg.
+    """
+
+    out: Path | None = None
+    only: tuple[str, ...] = ()
+    kinds: tuple[str, ...] = ("png", "pdf")
+
+    def __post_init__(self) -> None:
+        if not self.kinds or not set(self.kinds) <= set(KINDS):
+            raise ConfigError("unknown kind of figure", value=self.kinds, fix=f"Use some of {', '.join(KINDS)}.")
 
 
 @dataclass(frozen=True, kw_only=True)

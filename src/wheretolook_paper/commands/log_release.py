@@ -12,7 +12,7 @@ from wheretolook.dataset.dataset_lock import reads_dataset
 from wheretolook.tracking import TrackingConfig, check_store, ui_command
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.files import temporary_folder
-from wheretolook_paper.figures.config import FiguresConfig
+from wheretolook_paper.commands.figures import FiguresConfig
 
 if TYPE_CHECKING:
     from wheretolook.dataset.layout import Dataset

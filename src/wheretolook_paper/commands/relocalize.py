@@ -20,8 +20,9 @@ from wheretolook.commands.options import (
 from wheretolook.dataset.dataset_lock import reading
 from wheretolook.dataset.layout import Dataset, SceneFolder
 from wheretolook.tracking import TrackingConfig, check_store, kept_if_not_logged
-from wheretolook.utils.errors import ConfigError, SceneError, check_choice, check_range, no_option
+from wheretolook.utils.errors import check_choice, check_range, no_option
 from wheretolook.utils.files import atomic_write, fingerprint, write_text
+from wheretolook_paper.commands.compare_paths import scenes_with_meshes
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -104,12 +105,7 @@ class Relocalize(SceneOptions):
         with reading(self.root, "relocalize", FOLDER):
             dataset = load_dataset(self, "sample")
             check_store(self.tracking)
-            scenes = [dataset.scene(name) for name in self.in_scenes] or list(dataset.split("test"))
-            if not scenes:
-                raise ConfigError("the dataset has no test scene", path=dataset.root, fix="Name scenes in --in-scenes.")
-            for files in scenes:
-                if not files.mesh.is_file():
-                    raise SceneError("rendering needs a mesh", path=files.folder, fix="Choose other scenes.")
+            scenes = scenes_with_meshes(dataset, self.in_scenes)
             tables = [self._simulated(dataset, files, log).assign(scene=files.name) for files in scenes]
             table = pd.concat(tables, ignore_index=True)
             summary = summarize(table, self.confidence)
@@ -135,7 +131,7 @@ class Relocalize(SceneOptions):
 
         scene = open_scene(self, files)
         weights = resolve_weights(self.method, self.weights, dataset=dataset, log=log)
-        extractor = extractor_of(files, self.mapping.extractor)
+        extractor = extractor_of(files, self.extractor)
         return SimulatedRobot(scene, scene_scorer(scene, self.method, weights), extractor)
 
     def _places(self, files: SceneFolder) -> dict[int, Float]:
@@ -168,21 +164,21 @@ class Relocalize(SceneOptions):
 
     def _log(self, dataset: Dataset, summary: pd.DataFrame, results: Path) -> None:
         """Log the comparison as a run with its files, and a nested run for each policy."""
-        from wheretolook.tracking import BEST_TAG, NestedRun, log, log_nested, start_run
+        from wheretolook.tracking import BEST_TAG, NestedRun
+        from wheretolook_paper.evaluation.comparison import log_comparison
 
         params = {"dataset": dataset.name, "places": self.places, "views": self.views, "method": self.method}
         params |= {"confidence": self.confidence, "seed": self.seed}
         rows = summary.set_index("policy").to_dict("index")
         best = max(rows, key=lambda policy: float(rows[policy]["right"]) if policy != "known" else -1.0)
-        with start_run(self.tracking, "all policies", FOLDER, params, {BEST_TAG: str(best)}) as (client, run):
-            log(client, run, metrics={str(name): float(value) for name, value in rows[best].items()})
-            for name in (f"{FOLDER}.csv", f"{FOLDER}.md"):
-                client.log_artifact(run, str(results / name))
-            nested = [
-                NestedRun(str(policy), {**params, "policy": policy}, {str(k): float(v) for k, v in row.items()})
-                for policy, row in rows.items()
-            ]
-            log_nested(self.tracking, run, FOLDER, nested)
+        metrics = {str(name): float(value) for name, value in rows[best].items()}
+        nested = [
+            NestedRun(str(policy), {**params, "policy": policy}, {str(k): float(v) for k, v in row.items()})
+            for policy, row in rows.items()
+        ]
+        files = [results / f"{FOLDER}.csv", results / f"{FOLDER}.md"]
+        about = {BEST_TAG: str(best)}
+        log_comparison(self.tracking, "all policies", FOLDER, params, metrics, nested, files, about=about)
 
     def _film(self, dataset: Dataset, table: pd.DataFrame, path: Path, log: Log) -> None:
         """Film the place where the last policy succeeds with the lowest probability of the first view's pose."""
@@ -191,7 +187,7 @@ class Relocalize(SceneOptions):
         from wheretolook_paper.evaluation.relocalization import Place
         from wheretolook_paper.figures.animation import save_moving
         from wheretolook_paper.figures.dollhouse import dollhouse
-        from wheretolook_paper.figures.look_story import FRAME_MS, LAST_MS, film_frames, story_of_steps
+        from wheretolook_paper.figures.looks import FRAME_MS, LAST_MS, film_frames, story_of_steps
 
         last = table[(table["policy"] == self.policies[-1]) & (table["hypothesis"] == 0)]
         right = last[is_good(last) & (last["n_looks"] == self.views)].set_index(["scene", "location_id"]).index

@@ -4,35 +4,58 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
+from wheretolook.commands.demo import OVERVIEW, Demo
+from wheretolook.commands.options import open_scene
 from wheretolook.dataset.layout import Dataset, SceneFolder
 from wheretolook.dataset.viewpoint_files import has_matches, read_table
 from wheretolook.dataset.viewpoint_table import is_good, poses
-from wheretolook.tracking import kept_if_not_logged
+from wheretolook.evaluation.config import EvaluateConfig
+from wheretolook.evaluation.results import SCORES_MD, SCORES_PNG, VARIANTS_CSV, main_rows, read_scores, results_folder
+from wheretolook.figures.floor_plan import save_figure
+from wheretolook.geometry.poses import Float, camera_centers, poses_looking_along
+from wheretolook.geometry.views import Views
+from wheretolook.looks.selection import SetScoreModel, candidate_views, score_of_set
+from wheretolook.scorers.base import Scorer
+from wheretolook.scorers.weights import load_scorer, resolve_weights
+from wheretolook.tracking import TrackingConfig, kept_if_not_logged
 from wheretolook.utils.files import write_text
-from wheretolook_paper.evaluation.looks import LOOKS_CSV, LOOKS_MD, NUMBERS, STRATEGIES, log_looks, write_looks
-
-if TYPE_CHECKING:
-    from wheretolook.commands.demo import Demo
-    from wheretolook.evaluation.config import EvaluateConfig
-    from wheretolook.geometry.poses import Float
-    from wheretolook.geometry.views import Views
-    from wheretolook.scorers.base import Scorer
-    from wheretolook.tracking import TrackingConfig
-
-LEVEL_DEG = 25.0  # pitch at most of a camera held level
+from wheretolook_paper.evaluation.label_report import label_markdown, label_summary
+from wheretolook_paper.evaluation.looks import (
+    LOOKS_CSV,
+    LOOKS_MD,
+    NUMBERS,
+    STRATEGIES,
+    choose_set,
+    label_sets,
+    log_looks,
+    write_looks,
+)
+from wheretolook_paper.evaluation.paper_tables import write_paper_tables
+from wheretolook_paper.evaluation.score_report import score_markdown
+from wheretolook_paper.figures.animation import save_moving
+from wheretolook_paper.figures.dollhouse import dollhouse
+from wheretolook_paper.figures.labels import label_figure
+from wheretolook_paper.figures.overview import (
+    Overview,
+    instructive_location,
+    outcome_in_words,
+    overview_figure,
+    rendered_views,
+    shares_good,
+)
+from wheretolook_paper.figures.paths import FRAME_MS, film_frames, methods_figure, still_figure
+from wheretolook_paper.figures.scores import calibration_figure, occlusion_figure, regret_figure, score_figure
+from wheretolook_paper.figures.style import scene_label
+from wheretolook_paper.styles import in_table_order, method_style
 
 
 def report_labels(folder: Path, views: pd.DataFrame, title: str) -> tuple[Path, ...]:
     """Write `labels.md` and `labels.png` of a dataset's `pooled_labels`; return their paths."""
-    from wheretolook.figures.floor_plan import save_figure
-    from wheretolook_paper.evaluation.label_report import label_markdown, label_summary
-    from wheretolook_paper.figures.labels import label_figure
-
     summary = label_summary(views)
     save_figure(label_figure(summary), folder / "labels.png")
     write_text(folder / "labels.md", label_markdown(summary, title))
@@ -45,15 +68,6 @@ def report_scores(folder: Path, table: pd.DataFrame, calibration: pd.DataFrame, 
     The figures are `scores.png`, `regret.png`, of curves `calibration.png`, of several occlusion models
     `occlusion.png`; those of an earlier evaluation are removed. Returns the text of `scores.md`.
     """
-    from wheretolook.evaluation.results import SCORES_MD, SCORES_PNG, VARIANTS_CSV, main_rows, read_scores
-    from wheretolook.figures.floor_plan import save_figure
-    from wheretolook_paper.evaluation.paper_tables import write_paper_tables
-    from wheretolook_paper.evaluation.score_report import score_markdown
-    from wheretolook_paper.figures.calibration import calibration_figure
-    from wheretolook_paper.figures.occlusion import occlusion_figure
-    from wheretolook_paper.figures.scores import regret_figure, score_figure
-    from wheretolook_paper.styles import in_table_order
-
     table = in_table_order(table)
     text = score_markdown(table, title)
     write_text(folder / SCORES_MD, text)
@@ -83,10 +97,6 @@ def draw_path(views: dict[str, Views], landmarks: Float, title: str, folder: Pat
         folder: where the files are written.
         film: suffix of a film of the path, gif or mp4; none for no film.
     """
-    from wheretolook.figures.floor_plan import save_figure
-    from wheretolook_paper.figures.animation import save_moving
-    from wheretolook_paper.figures.path_film import FRAME_MS, film_frames, methods_figure, still_figure
-
     written = ["path.png"]
     seen = list(views.values())[-1]
     save_figure(still_figure(seen, landmarks, title), folder / "path.png")
@@ -107,23 +117,6 @@ def draw_overview(options: Demo, weights: Path) -> None:
     a folder of which the best file is taken. Raises TableError if the last scene is not labelled, WeightsError if the
     weights cannot be used.
     """
-    from wheretolook.commands.demo import OVERVIEW
-    from wheretolook.commands.options import open_scene
-    from wheretolook.figures.floor_plan import save_figure
-    from wheretolook.geometry.poses import camera_centers, poses_looking_along
-    from wheretolook.scorers.weights import load_scorer
-    from wheretolook_paper.figures.dollhouse import dollhouse
-    from wheretolook_paper.figures.overview import (
-        Overview,
-        instructive_location,
-        outcome_in_words,
-        overview_figure,
-        rendered_views,
-        shares_good,
-    )
-    from wheretolook_paper.figures.style import scene_label
-    from wheretolook_paper.styles import method_style
-
     scene = open_scene(options, Dataset.load(options.root).scenes[-1])
     table = scene.folder.read_table()
     scorer = load_scorer(scene.folder.localization_map(scene.camera, scene.device), weights)
@@ -134,7 +127,8 @@ def draw_overview(options: Demo, weights: Path) -> None:
     candidates = table[table["location_id"] == chosen]
     cam_from_world = poses(candidates)
     scores = scorer.score(cam_from_world)
-    level = np.abs(np.arcsin(np.clip(cam_from_world[:, 2, 2], -1, 1))) <= np.radians(LEVEL_DEG)
+    # a camera is held level up to a pitch of 25 degrees
+    level = np.abs(np.arcsin(np.clip(cam_from_world[:, 2, 2], -1, 1))) <= np.radians(25.0)
     worst_row = np.argmin(np.where(level | ~level.any(), scores, np.inf))
     shown_rows = [int(np.argmax(scores)), int(worst_row)]
     best, worst = rendered_views(scene, candidates.iloc[shown_rows], scores[shown_rows], outcome_in_words)
@@ -179,9 +173,6 @@ def evaluate_look_sets(
     Views are scored by the first of `evaluate.weights`, or those of `resolve_weights`. Returns `look_table`, or None
     if there is no scene with one camera whose labels have the pixels of their matches (`--label.store_pixels true`).
     """
-    from wheretolook.evaluation.results import results_folder
-    from wheretolook.scorers.weights import load_scorer, resolve_weights
-
     scenes = [
         scene
         for scene in dataset.split(evaluate.split)
@@ -214,10 +205,6 @@ def compare_looks(scene: SceneFolder, scorer: Scorer, config: LookConfig, progre
 
     Raises a TableError if the labels lack the pixels of their matches.
     """
-    from wheretolook.looks.selection import SetScoreModel, candidate_views, score_of_set
-    from wheretolook_paper.evaluation.joint_labels import label_sets
-    from wheretolook_paper.evaluation.look_strategies import choose_set
-
     table = read_table(scene.table, pixels=True)
     cam_from_world = poses(table)
     good = is_good(table)

@@ -1,18 +1,38 @@
-"""Tables of view sets: the share of locations localized by each selection strategy, and the number of views needed."""
+"""Sets of views: strategies of selection, labels by joint localization, and tables by strategy and number of views.
+
+Sets are localized jointly from the stored matches of single views (`--label.store_pixels true`), without rendering.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+import time
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+from tqdm.auto import tqdm
 
+from wheretolook.dataset.viewpoint_files import MATCH_FIELDS
+from wheretolook.dataset.viewpoint_table import CAMERA_ID, PIXELS, poses
 from wheretolook.evaluation.statistics import ClusterBootstrap
-from wheretolook.tracking import BEST_TAG, TrackingConfig
+from wheretolook.geometry.camera import Camera
+from wheretolook.geometry.poses import Float, pose_error
+from wheretolook.localization.confidence import ConfidenceModel
+from wheretolook.localization.config import LocalizerConfig
+from wheretolook.localization.estimation import PoseEstimator, SingleViewPoses
+from wheretolook.localization.rig import Look, rig_of
+from wheretolook.localization.rig_localization import JointLocalization, JointLocalizer
+from wheretolook.looks.selection import Detections, Rotations, SetScoreModel, select_views
+from wheretolook.tracking import BEST_TAG, NestedRun, TrackingConfig
+from wheretolook.utils.errors import TableError
 from wheretolook.utils.files import write_text
 from wheretolook.utils.texts import markdown_table
+from wheretolook_paper.evaluation.comparison import interval_text, log_comparison
+from wheretolook_paper.fisher.metrics import metric_of
 
 LOOKS_CSV = "looks.csv"
 LOOKS_MD = "looks.md"
@@ -32,8 +52,6 @@ STRATEGIES = {
 
 TOGETHER = "together"
 """The product's strategy."""
-
-_NUMBERS = ("good", "gain", "any_good", "sure", "sure_right")
 
 
 def look_table(sets: pd.DataFrame, resamples: int = 2000, seed: int = 0) -> pd.DataFrame:
@@ -88,24 +106,20 @@ def write_looks(folder: Path, sets: pd.DataFrame, title: str) -> pd.DataFrame:
     stopping = stopping_table(sets)
     write_text(folder / LOOKS_CSV, table.to_csv(index=False))
     shares = [
-        [row.strategy, str(row.n_looks), str(row.n_locations), _share(row.good, row.good_low, row.good_high),
-         _share(row.gain, row.gain_low, row.gain_high), f"{100 * row.any_good:.1f}", f"{100 * row.sure:.1f}",
-         "" if np.isnan(row.sure_right) else f"{100 * row.sure_right:.1f}"]
-        for row in cast("Iterable[Any]", table.itertuples())
+        [row["strategy"], str(row["n_looks"]), str(row["n_locations"]), interval_text(row, "good"),
+         interval_text(row, "gain"), f"{100 * row['any_good']:.1f}", f"{100 * row['sure']:.1f}",
+         "" if np.isnan(row["sure_right"]) else f"{100 * row['sure_right']:.1f}"]
+        for row in table.to_dict("records")
     ]  # fmt: skip
     head = ["looks", "N", "places", "localized together", "over one look", "any alone", "sure", "of these right"]
     stops = [
-        [f"{r.asked:.2f}", f"{r.looks:.2f}", f"{100 * r.good:.1f}", f"{100 * r.of_most:.1f}"]
-        for r in cast("Iterable[Any]", stopping.itertuples())
+        [f"{row['asked']:.2f}", f"{row['looks']:.2f}", f"{100 * row['good']:.1f}", f"{100 * row['of_most']:.1f}"]
+        for row in stopping.to_dict("records")
     ]
     parts = [f"# {title}", markdown_table(head, shares)]
     parts += ["## When to stop", markdown_table(["asked", "looks", "localized", "of all looks' share"], stops)]
     write_text(folder / LOOKS_MD, "\n\n".join(parts) + "\n")
     return table
-
-
-def _share(value: float, low: float, high: float) -> str:
-    return f"{100 * value:.1f} [{100 * low:.1f}, {100 * high:.1f}]"
 
 
 def log_looks(
@@ -119,22 +133,182 @@ def log_looks(
 
     The run has the metrics of the best strategy for the largest sets.
     """
-    from wheretolook.tracking import NestedRun, log, log_nested, start_run
-
-    numbers = [name for name in _NUMBERS if name in table]
+    numbers = [name for name in ("good", "gain", "any_good", "sure", "sure_right") if name in table]
     best = table[table["n_looks"] == table["n_looks"].max()].nlargest(1, "good").iloc[0]
-    run_tags = {**(tags or {}), "dataset": str(params["dataset"]), BEST_TAG: str(best["strategy"])}
-    with start_run(tracking, "all sets", "looks", dict(params), tags=run_tags) as (client, run):
-        log(client, run, metrics={name: float(best[name]) for name in numbers})
-        for file in files:
-            client.log_artifact(run, str(file))
-        runs = (
-            NestedRun(
-                f"{row['strategy']}, {row['n_looks']} looks",
-                {**params, "strategy": row["strategy"], "n_looks": row["n_looks"]},
-                {name: float(row[name]) for name in numbers},
-            )
-            for row in table.to_dict("records")
+    nested = [
+        NestedRun(
+            f"{row['strategy']}, {row['n_looks']} looks",
+            {**params, "strategy": row["strategy"], "n_looks": row["n_looks"]},
+            {name: float(row[name]) for name in numbers},
         )
-        log_nested(tracking, run, "looks", runs, dict(tags or {}))
-    return run
+        for row in table.to_dict("records")
+    ]
+    metrics = {name: float(best[name]) for name in numbers}
+    about = {"dataset": str(params["dataset"]), BEST_TAG: str(best["strategy"])}
+    return log_comparison(tracking, "all sets", "looks", params, metrics, nested, files, tags, about)
+
+
+def information_score(sums: Float, p_none: Float) -> Float:
+    """Return the log determinant (B,) of the information in sums (B, N_SUMS)."""
+    return metric_of(np.asarray(sums)[..., 1:], "logdet")
+
+
+def count_score(sums: Float, p_none: Float) -> Float:
+    """Return how many different landmarks are expected to be detected, (B,)."""
+    return np.asarray(sums)[..., 0]
+
+
+def best_separated(scores: Float, directions: Float, n: int, separation_deg: float = 40.0) -> list[int]:
+    """Return the n views with the best single-view scores (D,), separated by an angle if there are as many."""
+    order = np.argsort(-np.asarray(scores), kind="stable").tolist()
+    near = np.cos(np.radians(separation_deg))
+    views: list[int] = []
+    for view in order:
+        if all(directions[view] @ directions[other] <= near for other in views):
+            views.append(view)
+    return (views + [view for view in order if view not in views])[:n]
+
+
+def evenly_spread(directions: Float, n: int, first: int) -> list[int]:
+    """Return n views spread from a first one on: always the one whose nearest is farthest."""
+    views = [first]
+    while len(views) < n:
+        nearest = (directions @ directions[views].T).max(1)
+        nearest[views] = np.inf
+        views.append(int(nearest.argmin()))
+    return views
+
+
+def choose_set(
+    strategy: str, n: int, axes: Float, scores: Float, views: Detections, certain: Detections, rng: np.random.Generator
+) -> list[int]:
+    """Return the rows of n views along axes (D, 3) with scores (D,) that a strategy of the tables chooses."""
+    if strategy == "random":
+        return [int(row) for row in rng.choice(len(axes), n, replace=False)]
+    if strategy == "one-by-one":
+        return best_separated(scores, axes, n)
+    if strategy == "even":
+        return evenly_spread(axes, n, int(np.argmax(scores)))
+    rotations = Rotations(axes)
+    if strategy in ("visible", "fisher"):
+        objective = count_score if strategy == "visible" else information_score
+        return list(select_views(certain, objective, n, rotations).rows)
+    options = {"exchanges": 0} if strategy == "in-turn" else {}
+    chosen = select_views(views, SetScoreModel.bundled(), n, rotations, single=scores, **options)
+    return list(chosen.rows)
+
+
+SET_COLUMNS = (
+    "n_looks",
+    "location_id",
+    "status",
+    "error_m",
+    "error_deg",
+    "n_matches",
+    "n_inliers",
+    "support",
+    "elsewhere",
+    "own",
+    "rival_own",
+    "deviation_m",
+    "deviation_deg",
+    "confidence",
+    "seconds",
+)
+"""Columns of `label_sets`. `status`, `error_m` and `error_deg` are as for single viewpoints, so `is_good` applies to sets,
+too; `elsewhere` is the rival support, `own` and `rival_own` are the unique support of pose and rival."""
+
+
+def label_sets(
+    table: pd.DataFrame,
+    sets: Sequence[Sequence[int] | NDArray[np.integer]],
+    points: Float,
+    cameras: Camera | Mapping[int, Camera],
+    config: LocalizerConfig = LocalizerConfig(),
+    turn_noise_deg: float = 0.0,
+    seed: int = 0,
+    progress: str | None = None,
+    rigs: Sequence[Float] | None = None,
+) -> pd.DataFrame:
+    """Localize sets of a table's views jointly and measure the errors.
+
+    A set has rows of the table with views of one location, whose relative rotations are those of the table, with
+    `turn_noise_deg` of noise about each axis drawn from the seed; its error is that of the worst view. With `rigs`,
+    cam_from_rig (N, 3, 4) in metres for each set, its views may be of several locations; its error is that of its
+    first view. `points` (N, 3) m are the landmarks. A set of one view gets the label of a single image, up to the order
+    of its matches. `progress` is the title of a progress bar. Returns a row per set, with `SET_COLUMNS`.
+
+    Raises TableError if the table has no stored pixels or a row is invalid, PoseError if views of a set are not from
+    one location, ConfigError for negative noise.
+    """
+    missing = [name for name in (*MATCH_FIELDS.names[:1], PIXELS) if name not in table]
+    if missing:
+        fix = "Label with `--label.store_pixels true`, and read the table with `pixels=True`."
+        raise TableError("the table has no pixels of matches", value=missing, fix=fix)
+    localizer = JointLocalizer(PoseEstimator(points, config), turn_noise_deg)
+    rng = np.random.default_rng(seed)
+    true_poses = poses(table)
+    locations = table["location_id"].tolist()
+    single_view: dict[int, SingleViewPoses] = {}
+    known: dict[tuple[int, ...], tuple[object, ...]] = {}  # repeated sets, if nothing is drawn for each
+    rows: list[tuple[object, ...]] = []
+    for number, members in enumerate(tqdm(sets, desc=progress, unit="set", disable=progress is None)):
+        key = tuple(map(int, members))
+        if not key or max(key) >= len(table):
+            raise TableError(f"a set of views has none or wrong rows of {len(table)}", value=key)
+        if key not in known or turn_noise_deg or rigs is not None:
+            true = true_poses[list(key)]
+            rig = _noisy(rig_of(true), turn_noise_deg, rng) if rigs is None else rigs[number]
+            looks = [_look(table, row, pose, cameras, len(points)) for row, pose in zip(key, rig, strict=True)]
+            start = time.perf_counter()
+            for row, look in zip(key, looks, strict=True):
+                if row not in single_view:
+                    single_view[row] = localizer.single_view_poses(look)
+            result = localizer.localize(looks, [single_view[row] for row in key])
+            seconds = time.perf_counter() - start
+            label = set_label(result, true if rigs is None else true[:1])
+            known[key] = (len(key), locations[key[0]], *label, seconds)
+        rows.append(known[key])
+    return pd.DataFrame(rows, columns=list(SET_COLUMNS))
+
+
+def set_label(result: JointLocalization, true: Float) -> tuple[object, ...]:
+    """Return `SET_COLUMNS` from status to confidence, given the true poses (N, 3, 4) of the first N views."""
+    error_m = error_deg = np.nan
+    if result.cams_from_world is not None:
+        error_m, error_deg = (error.max() for error in pose_error(result.cams_from_world[: len(true)], true))
+    return (
+        result.status,
+        error_m,
+        error_deg,
+        result.n_matches,
+        result.n_inliers,
+        result.support,
+        result.rival_support,
+        *result.unique_support,
+        *result.deviation,
+        ConfidenceModel.bundled().of(result),
+    )
+
+
+def _look(
+    table: pd.DataFrame, row: int, cam_from_rig: Float, cameras: Camera | Mapping[int, Camera], n_points: int
+) -> Look:
+    if isinstance(cameras, Mapping):
+        cameras = cameras[table[CAMERA_ID].to_numpy()[row]] if CAMERA_ID in table else next(iter(cameras.values()))
+    landmarks = np.asarray(table["matched_rows"].iat[row], dtype=np.int64)
+    pixels = np.asarray(table[PIXELS].iat[row], dtype=np.float64).reshape(-1, 2)
+    if landmarks.max(initial=0) >= n_points:
+        problem = f"a view matched a landmark that the map of {n_points} lacks"
+        raise TableError(problem, value=int(landmarks.max()), fix="Label the scene again with its present map.")
+    return Look(cam_from_rig, pixels, landmarks, cameras)
+
+
+def _noisy(cam_from_rig: Float, turn_noise_deg: float, rng: np.random.Generator) -> Float:
+    """Perturb the rotations of all views but the first, which defines the rig."""
+    if turn_noise_deg == 0:
+        return cam_from_rig
+
+    noise = Rotation.from_rotvec(np.radians(rng.normal(0, turn_noise_deg, (len(cam_from_rig), 3)))).as_matrix()
+    noise[0] = np.eye(3)
+    return np.concatenate([noise @ cam_from_rig[:, :, :3], cam_from_rig[:, :, 3:]], axis=2)

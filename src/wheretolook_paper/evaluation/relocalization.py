@@ -27,11 +27,12 @@ from wheretolook.localization.rig_localization import JointLocalization
 from wheretolook.looks.next_look import NextLookSelector, angles_to_views, mean_scores_by_pitch
 from wheretolook.scorers.base import Scorer
 from wheretolook.utils.texts import markdown_table
-from wheretolook_paper.evaluation.joint_labels import SET_COLUMNS, set_label
+from wheretolook_paper.evaluation.comparison import interval_text
+from wheretolook_paper.evaluation.looks import SET_COLUMNS, set_label
 
 COLUMNS = ("location_id", "policy", "n_looks", "hypothesis", *SET_COLUMNS[2:-1])
 """Columns of `simulate`: `hypothesis` is 0 for the chosen pose, and counts its rivals; others are those of
-`wheretolook_paper.evaluation.joint_labels`."""
+`wheretolook_paper.evaluation.looks`."""
 
 
 class Place:
@@ -172,11 +173,8 @@ def summary_markdown(summary: pd.DataFrame, confidence: float) -> str:
     heads += ["right at stop", "views until stop", "confident", "of these right", "area under precision over coverage"]
     lines = []
     for row in summary.to_dict("records"):
-        cells = [
-            f"{100 * row[name]:.1f} [{100 * row[f'{name}_low']:.1f}, {100 * row[f'{name}_high']:.1f}]"
-            for name in shares
-        ]
-        views = f"{row['views']:.2f} [{row['views_low']:.2f}, {row['views_high']:.2f}]"
+        cells = [interval_text(row, name) for name in shares]
+        views = interval_text(row, "views", 1, 2)
         last = [f"{100 * row[name]:.1f}" for name in ("confident", "precision")]
         lines.append([str(row["policy"]), str(row["places"]), *cells, views, *last, f"{row['precision_area']:.3f}"])
     head = f"Share of places whose pose is right, in % [95 % interval over places]; stop at a confidence of {confidence:g}."

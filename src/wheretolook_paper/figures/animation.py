@@ -16,9 +16,6 @@ from wheretolook.utils.files import atomic_write
 
 Pixels = NDArray[np.uint8]  # an image (H, W, 3)
 
-WEBP_QUALITY = 55  # of 100
-GIF_COLORS = 128
-
 
 def pixels_of(figure: Figure) -> Pixels:
     """Render a figure to an image (H, W, 3)."""
@@ -45,9 +42,9 @@ def _save_animation(frames: Iterable[Pixels], frame_ms: int, last_ms: int, parti
 
     is_gif = partial.suffix == ".gif"
     images = (Image.fromarray(frame) for frame in frames)
-    first, *rest = (image.quantize(GIF_COLORS) if is_gif else image for image in images)
+    first, *rest = (image.quantize(128) if is_gif else image for image in images)
     times = [frame_ms] * len(rest) + [last_ms]
-    options: dict[str, Any] = {} if is_gif else {"quality": WEBP_QUALITY, "method": 6}
+    options: dict[str, Any] = {} if is_gif else {"quality": 55, "method": 6}
     first.save(partial, save_all=True, append_images=rest, duration=times, loop=0, **options)
 
 

@@ -17,9 +17,6 @@ from wheretolook.geometry.poses import Float, poses_looking_along, rotation_look
 from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.utils.errors import SceneError
 
-AZIMUTH_DEG = -110.0  # direction of the eye, counter-clockwise from +x
-EYE_DISTANCE = 25.0  # in diagonals of the scene: close to an orthographic projection
-
 
 @dataclass(frozen=True, eq=False)
 class Dollhouse:
@@ -71,7 +68,7 @@ def dollhouse(
     bounds = mesh.bounds
     if cut_m is not None:
         mesh = cut_above(mesh, cut_m)
-    azimuth = np.radians(AZIMUTH_DEG)
+    azimuth = np.radians(-110.0)  # direction of the eye, counter-clockwise from +x
     elevation = np.radians(elevation_deg)
     level = np.cos(elevation) if elevation_deg < 90 else 0.0
     to_eye = np.array([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)])
@@ -84,7 +81,8 @@ def dollhouse(
     in_eye_frame = corners @ rotation.T
     extent = np.ptp(in_eye_frame[:, :2], axis=0)
     center = (in_eye_frame.min(0) + in_eye_frame.max(0)) / 2 @ rotation
-    distance = EYE_DISTANCE * float(np.linalg.norm(np.ptp(bounds, axis=0)))
+    # so many diagonals of the scene away, the projection is close to an orthographic one
+    distance = 25.0 * float(np.linalg.norm(np.ptp(bounds, axis=0)))
     focal_px = 0.98 * width_px * distance / extent[0]
     height_px = max(2, int(np.ceil(width_px * extent[1] / extent[0])))
     camera = PinholeCamera(width_px, height_px, float(focal_px))

@@ -21,8 +21,6 @@ from wheretolook.view.drawing import frustum_corners, frustum_segments
 from wheretolook_paper.figures.dollhouse import Dollhouse, draw_house, draw_points, draw_segments
 from wheretolook_paper.figures.style import ONE_COLUMN_IN, ORANGE, PRINT, TWO_COLUMNS_IN
 
-_GLYPH = 32  # directions drawn of a location
-
 
 @dataclass(frozen=True, eq=False)
 class Pipeline:
@@ -76,7 +74,7 @@ def _draw_map(axes: Axes, pipeline: Pipeline) -> None:
 
 def _draw_samples(axes: Axes, pipeline: Pipeline) -> None:
     spacing = _spacing(pipeline.locations)
-    ends = pipeline.locations[:, None] + 0.42 * spacing * fibonacci_sphere(_GLYPH)
+    ends = pipeline.locations[:, None] + 0.42 * spacing * fibonacci_sphere(32)  # directions drawn of a location
     segments = np.stack([np.broadcast_to(pipeline.locations[:, None], ends.shape), ends], axis=-2)
     draw_segments(axes, pipeline.house, segments, color="white", linewidth=1.1)
     draw_segments(axes, pipeline.house, segments, color=BLUE, linewidth=0.5)

@@ -15,8 +15,6 @@ from wheretolook.geometry.poses import Float
 from wheretolook.view.drawing import frustum_segments
 from wheretolook_paper.figures.style import ORANGE
 
-FRUSTUM_M = 0.25  # depth of the cameras that are drawn
-
 
 def show_scene(mesh: TexturedMesh, landmarks: Float, cameras: Float | None, cut_m: float = np.inf) -> None:
     """Show a scene in a window until that is closed. Needs a display.
@@ -27,7 +25,7 @@ def show_scene(mesh: TexturedMesh, landmarks: Float, cameras: Float | None, cut_
     cloud.paint_uniform_color(np.array(to_rgb(ORANGE)))
     geometries = [*_mesh_geometries(cut_above(mesh, cut_m)), _named("landmarks", cloud, "defaultUnlit", point_size=3)]
     if cameras is not None:
-        segments = frustum_segments(PinholeCamera(), cameras, FRUSTUM_M).reshape(-1, 3)
+        segments = frustum_segments(PinholeCamera(), cameras, depth_m=0.25).reshape(-1, 3)
         lines = o3d.geometry.LineSet(
             o3d.utility.Vector3dVector(segments.astype(np.float64)),
             o3d.utility.Vector2iVector(np.arange(len(segments), dtype=np.int32).reshape(-1, 2)),

@@ -26,8 +26,6 @@ from wheretolook.visibility.frustum import (
 from wheretolook_paper.fisher import exact_kernel
 from wheretolook_paper.fisher.exact_kernel import information_kernel
 
-CPU_VIEWS = 128  # views that a CPU thread takes at a time: some ten milliseconds of work
-
 
 def exact_information(views: PosedViews, device: str = "cpu") -> Float:
     """Return the information (B, 15) on the pose of each view, summed over its visible landmarks.
@@ -50,7 +48,8 @@ def exact_information(views: PosedViews, device: str = "cpu") -> Float:
         wp.launch(information_kernel, result.shape[0], [there, *bounds], [result], device=device)
         numbers[part] = result.numpy()
 
-    run_in_parts(len(sides), CPU_VIEWS if device == "cpu" else max(1, len(sides)), work, device)
+    # 128 views are some ten milliseconds of work of a CPU thread
+    run_in_parts(len(sides), 128 if device == "cpu" else max(1, len(sides)), work, device)
     return numbers
 
 

@@ -17,8 +17,6 @@ from wheretolook_paper.fisher.metrics_kernel import eigenvalues_kernel
 
 METRICS = ("mineig", "logdet", "trace")
 
-ROWS_AT_ONCE = 4096  # matrices that a thread of a CPU takes at a time: a few milliseconds
-
 
 def metric_of(numbers: ArrayLike, metric: str, device: str = "cpu") -> Float:
     """Return a metric (B,) of information matrices (B, 15) about the camera; more is better.
@@ -62,5 +60,6 @@ def eigenvalues(numbers: ArrayLike, pivots: ArrayLike | None = None, device: str
         values[part] = found.numpy()
 
     wp.load_module(metrics_kernel, device=device)  # only one thread may do that
-    run_in_parts(len(numbers), ROWS_AT_ONCE if device == "cpu" else max(1, len(numbers)), work, device)
+    # 4,096 matrices are a few milliseconds of work of a CPU thread
+    run_in_parts(len(numbers), 4096 if device == "cpu" else max(1, len(numbers)), work, device)
     return values

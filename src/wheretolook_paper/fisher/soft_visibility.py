@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
 import numpy as np
+from scipy.optimize import minimize_scalar
 
 from wheretolook.geometry.camera import Camera, ColmapCamera
 from wheretolook.geometry.lattices import fibonacci_sphere
@@ -130,7 +131,6 @@ class GaussianProcessVisibility(SoftVisibility):
 
 @lru_cache
 def _fitted(half_angle_rad: float, n_factors: int, steepness: float) -> GaussianProcessVisibility:
-    from scipy.optimize import minimize_scalar
 
     bearings = _unit(np.random.default_rng(0).normal(size=(1000, 3)))
 

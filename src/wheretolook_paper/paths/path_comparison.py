@@ -1,4 +1,7 @@
-"""Plan paths between the same starts and goals by several methods (paper, Sec. 4.3)."""
+"""Plan paths between the same starts and goals by several methods (paper, Sec. 4.3).
+
+Views along a given path are the optimal sequence, or by ActLoc's greedy rule.
+"""
 
 from __future__ import annotations
 
@@ -15,16 +18,23 @@ from scipy.spatial import cKDTree
 from tqdm.auto import tqdm
 
 from wheretolook.dataset.viewpoint_table import pose_columns
-from wheretolook.geometry.poses import Float, poses_looking_along
+from wheretolook.geometry.poses import Float, pan_tilt_angles, poses_looking_along
 from wheretolook.planning.config import FORWARD
 from wheretolook.planning.routes import PlannedPath
 from wheretolook.planning.rrt import plan_path
-from wheretolook.planning.view_sequence import TurnLimit, ViewSequence, best_sequence
+from wheretolook.planning.view_sequence import (
+    TurnLimit,
+    ViewSequence,
+    best_sequence,
+    between,
+    check_reached,
+    check_scores,
+    lengths_along,
+)
 from wheretolook.planning.viewpoint_map import ViewpointMap
 from wheretolook.space.free_space import FreeSpace, MappedSpace
 from wheretolook.utils.errors import PlanningError, SceneError
 from wheretolook_paper.paths.config import PathsConfig
-from wheretolook_paper.paths.greedy import greedy_sequence, resample_path
 
 PLANNED = "planned"
 GIVEN = "given"
@@ -33,17 +43,60 @@ GIVEN = "given"
 Space = FreeSpace | MappedSpace
 Rule = Callable[[Float, TurnLimit], ViewSequence]
 
-RULES: dict[str, Rule] = {"": best_sequence, "greedy": greedy_sequence}
-"""Selection of views along a given path, optimal and by ActLoc's rule, by the suffix of the method's name."""
-
-MAX_DRAWS = 50  # draws for each pair before giving up
 
 GRID_M = 0.25
 MAX_NODES = 200_000
 """Step and size limit of the grid that decides whether a goal is reachable."""
 
 BLOCK = 10_000  # points tested for free space at a time
-N_NEAREST = 8  # grid nodes tried as connections of a point
+
+
+SPACING_M = 0.2  # distance of waypoints in the Active Localization Benchmark
+TURN_PENALTY = 0.02
+"""Penalty of ActLoc's greedy rule (lambda) for each step of its lattice of yaws and pitches."""
+
+
+def greedy_sequence(scores: ArrayLike, limit: TurnLimit) -> ViewSequence:
+    """Choose directions in the order of the waypoints: the best score less a penalty for turning (ActLoc).
+
+    The penalty is for each step of 20 degrees of yaw and of pitch. Only directions within the limit are allowed. See
+    `best_sequence` for the arguments and what is raised.
+    """
+    values = check_scores(scores, limit)
+    n, d = values.shape
+    penalty = TURN_PENALTY * _cells(limit.directions)
+    ids = np.empty(n, dtype=np.int64)
+    for waypoint in range(n):
+        value = values[waypoint]
+        if waypoint > 0:
+            near = limit.neighbours[ids[waypoint - 1]]
+            allowed = np.bincount(near, minlength=d + 1)[:d] > 0
+            value = np.where(allowed, value - penalty[ids[waypoint - 1]], -np.inf)
+        check_reached(value, waypoint, limit)
+        ids[waypoint] = value.argmax()
+    return ViewSequence(ids, values[np.arange(n), ids])
+
+
+def resample_path(points: ArrayLike, spacing_m: float = SPACING_M) -> Float:
+    """Return waypoints (W, 3) m along a polyline (P, 3) m: its first point, one every `spacing_m` along it, and its last.
+
+    The last leg may be shorter than the others.
+    """
+    path = np.asarray(points, dtype=np.float64)
+    at = lengths_along(path)
+    # a remainder that is only rounding adds no waypoint
+    return between(at, path, np.append(np.arange(0, at[-1] - 1e-9 * spacing_m, spacing_m), at[-1]))
+
+
+def _cells(directions: Float) -> Float:
+    """Compute differences (D, D) of pitch plus, the short way round, of yaw between directions, in steps of 20 degrees."""
+    yaw, pitch = map(np.degrees, pan_tilt_angles(directions))
+    across = np.abs(yaw[:, None] - yaw)
+    return np.asarray((np.abs(pitch[:, None] - pitch) + np.minimum(across, 360 - across)) / 20)
+
+
+RULES: dict[str, Rule] = {"": best_sequence, "greedy": greedy_sequence}
+"""Selection of views along a given path, optimal and by ActLoc's rule, by the suffix of the method's name."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +122,7 @@ def draw_pairs(space: Space, config: PathsConfig) -> Float:
     low, high = space.bounds
     reachability = Reachability(space)
     found: list[Float] = []
-    for _ in range(MAX_DRAWS * config.pairs):
+    for _ in range(50 * config.pairs):  # draws for each pair before giving up
         if len(found) == config.pairs:
             break
         points = rng.uniform(low, high, (400, 3))
@@ -120,7 +173,8 @@ class Reachability:
     def _parts_near(self, point: ArrayLike) -> set[int]:
         if not len(self._nodes):
             return set()
-        near = np.atleast_1d(self._tree.query(point, k=min(N_NEAREST, len(self._nodes)))[1])
+        # the nearest eight nodes of the grid are tried as connections
+        near = np.atleast_1d(self._tree.query(point, k=min(8, len(self._nodes)))[1])
         straight = self.space.segments_are_free(np.tile(point, (len(near), 1)), self._nodes[near])
         return set(self._part[near[straight]].tolist())
 

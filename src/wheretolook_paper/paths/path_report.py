@@ -22,12 +22,10 @@ from wheretolook.tracking import (
     TrackingConfig,
     fingerprint_of,
     joined,
-    log,
-    log_nested,
     logged_last,
-    start_run,
 )
 from wheretolook.utils.texts import markdown_table
+from wheretolook_paper.evaluation.comparison import interval_text, log_comparison
 from wheretolook_paper.paths.config import PathsConfig
 
 PATHS_CSV = "paths.csv"
@@ -143,13 +141,8 @@ def path_markdown(summary: pd.DataFrame, config: PathsConfig) -> str:
         header += ["looks a place"] if with_looks else []
         lines = []
         for _, row in rows.iterrows():
-            localized, low, high = (f"{100 * row[f'localized{end}']:.1f}" for end in ("", "_low", "_high"))
-            times, times_low, times_high = (f"{row[f'times_forward{end}']:.2f}" for end in ("", "_low", "_high"))
-            cells = [
-                f"{localized} [{low}, {high}]",
-                f"{times} [{times_low}, {times_high}]",
-                f"{row['times_forward_length']:.2f}",
-            ]
+            cells = [interval_text(row, "localized"), interval_text(row, "times_forward", 1, 2)]
+            cells += [f"{row['times_forward_length']:.2f}"]
             cells += [f"{row['turn_deg_per_m']:.0f}", f"{row['failures']}"]
             cells += [f"{row['looks']:.2f}"] if with_looks else []
             lines.append([str(row["scene"]), str(row["method"]), *cells])
@@ -171,17 +164,12 @@ def log_paths(
         return known
     pooled = summary[summary["scene"] == summary["scene"].iloc[-1]]
     best = pooled[pooled["task"] == pooled["task"].iloc[0]].sort_values("localized", ascending=False).iloc[0]
-    all_tags = {**(tags or {}), FINGERPRINT_TAG: mark, BEST_TAG: str(best["method"])}
-    first = {name: float(best[name]) for name in ("localized", "times_forward", "times_forward_length")}
-    with start_run(tracking, ALL_METHODS, "paths", params, tags=all_tags) as (client, run):
-        log(client, run, metrics=first)
-        for name in (PATHS_CSV, PATHS_MD, PATHS_PNG):
-            if (results / name).is_file():
-                client.log_artifact(run, str(results / name))
-        nested = []
-        for row in pooled.to_dict("records"):
-            about = {**params, "task": row["task"], "method": row["method"]}
-            numbers = {str(key): float(value) for key, value in row.items() if key not in ("scene", "task", "method")}
-            nested.append(NestedRun(joined(row["method"], row["task"]), about, numbers))
-        log_nested(tracking, run, "paths", nested, tags)
-    return run
+    nested = []
+    for row in pooled.to_dict("records"):
+        about = {**params, "task": row["task"], "method": row["method"]}
+        numbers = {str(key): float(value) for key, value in row.items() if key not in ("scene", "task", "method")}
+        nested.append(NestedRun(joined(row["method"], row["task"]), about, numbers))
+    metrics = {name: float(best[name]) for name in ("localized", "times_forward", "times_forward_length")}
+    files = [path for name in (PATHS_CSV, PATHS_MD, PATHS_PNG) if (path := results / name).is_file()]
+    best_of = {FINGERPRINT_TAG: mark, BEST_TAG: str(best["method"])}
+    return log_comparison(tracking, ALL_METHODS, "paths", params, metrics, nested, files, tags, best_of)

@@ -16,13 +16,14 @@ from wheretolook.dataset.viewpoint_table import POSITIVE, label_shares, pooled_l
 from wheretolook.evaluation.results import SCORES_CSV, VARIANTS_CSV, read_scores
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.scorers.registry import learned
+from wheretolook.scorers.weights import resolve_weights
 from wheretolook.training.config import DECIDING
+from wheretolook.training.provenance import training_fingerprint
 from wheretolook.utils.errors import TableError, WeightsError
 from wheretolook.utils.files import read_json_object, sha256
 from wheretolook.utils.texts import markdown_table
 from wheretolook.visibility.occlusion import StoredOcclusion
-from wheretolook_paper.evaluation.comparisons import comparisons_markdown
-from wheretolook_paper.evaluation.score_report import score_markdown
+from wheretolook_paper.evaluation.score_report import comparisons_markdown, score_markdown
 from wheretolook_paper.release.copy import read_about, size_text, sizes
 from wheretolook_paper.release.training_histories import records
 from wheretolook_paper.styles import PAPER_NETWORKS, method_style
@@ -81,7 +82,6 @@ def _weight_files(release: Dataset) -> list[Path]:
 
 
 def _best(release: Dataset) -> Path:
-    from wheretolook.scorers.weights import resolve_weights
 
     best = resolve_weights(path=release.root / "weights")
     assert best is not None
@@ -220,7 +220,6 @@ def _table(
 
 
 def _fingerprints(release: Dataset, about: Mapping[str, Any]) -> str:
-    from wheretolook.training.provenance import training_fingerprint
 
     rows = [
         ["dataset", release.fingerprint()],

@@ -25,34 +25,38 @@ from wheretolook.training.provenance import HISTORY_CSV
 from wheretolook.utils.errors import ConfigError, MissingRunError, WhereToLookError
 from wheretolook.utils.files import write_text
 from wheretolook.utils.texts import markdown_table
-from wheretolook_paper.evaluation.comparisons import comparisons_markdown
+from wheretolook_paper.commands.figures import FiguresConfig
 from wheretolook_paper.evaluation.looks import LOOKS_CSV
-from wheretolook_paper.evaluation.score_report import score_markdown
-from wheretolook_paper.figures.calibration import calibration_figure
-from wheretolook_paper.figures.config import FiguresConfig
-from wheretolook_paper.figures.inputs import inputs_figure
-from wheretolook_paper.figures.lattices import fibonacci_figure
+from wheretolook_paper.evaluation.score_report import comparisons_markdown, score_markdown
 from wheretolook_paper.figures.looks import looks_figure
-from wheretolook_paper.figures.network_walkthrough import learning_figure
-from wheretolook_paper.figures.occlusion import occlusion_figure
-from wheretolook_paper.figures.path_film import methods_figure
-from wheretolook_paper.figures.paths import paths_figure
-from wheretolook_paper.figures.peaks import peaks_figure
-from wheretolook_paper.figures.photograph_paths import COMMAND, photograph_paths_figure, read_photograph_paths
+from wheretolook_paper.figures.network import inputs_figure, learning_figure, peaks_figure
+from wheretolook_paper.figures.paths import (
+    COMMAND,
+    methods_figure,
+    paths_figure,
+    photograph_paths_figure,
+    read_photograph_paths,
+)
 from wheretolook_paper.figures.pipeline import pipeline_figure
 from wheretolook_paper.figures.runtimes import runtime_figure, scaling_figure
-from wheretolook_paper.figures.sampling import sampling_figure
-from wheretolook_paper.figures.scores import regret_figure, score_figure
-from wheretolook_paper.figures.top_n import top_n_figure
-from wheretolook_paper.figures.training import training_figure
+from wheretolook_paper.figures.sampling import fibonacci_figure, sampling_figure
+from wheretolook_paper.figures.scores import (
+    calibration_figure,
+    occlusion_figure,
+    regret_figure,
+    score_figure,
+    top_n_figure,
+    training_figure,
+)
 from wheretolook_paper.paths.path_report import PATHS_CSV
-from wheretolook_paper.release.benchmark_runs import RUNTIMES_CSV, SCALING_CSV
 from wheretolook_paper.release.copy import is_release, read_about
-from wheretolook_paper.release.paper_architecture import paper_architecture_table
-from wheretolook_paper.release.showcase import Showcase, open_showcase
-from wheretolook_paper.release.showcase_figures import (
+from wheretolook_paper.release.mlp_architecture import paper_architecture_table
+from wheretolook_paper.release.runs import RUNTIMES_CSV, SCALING_CSV
+from wheretolook_paper.release.showcase import (
     Learning,
+    Showcase,
     learning_of,
+    open_showcase,
     peaks_of,
     pipeline_of,
     planned_views,

@@ -19,6 +19,8 @@ from wheretolook.dataset.viewpoint_files import write_table
 from wheretolook.mapping.colmap_model import CAMERAS_FILE, save_mapping_poses
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.scorers.registry import Method, learned, scorers
+from wheretolook.training.provenance import was_trained_on, weights_path
+from wheretolook.training.weights import preference, read_record, read_training, read_weights, write_weights
 from wheretolook.utils.errors import ConfigError, StorageError, WeightsError
 from wheretolook.utils.files import read_json_object, safe_child, sha256, write_json
 from wheretolook.utils.package import VERSION
@@ -97,8 +99,6 @@ class Choice:
 
 def trained_weights(release: Dataset) -> dict[Path, Method]:
     """Return the weights in a release's folder that score views by themselves, and their methods."""
-    from wheretolook.training.provenance import weights_path
-
     paths = {weights_path(release, name): method for name, method in learned().items() if name in scorers()}
     return {path: method for path, method in paths.items() if path.is_file()}
 
@@ -108,9 +108,6 @@ def choose_weights_to_ship(release: Dataset) -> Choice:
 
     Raises WeightsError if the paper's network has no weights, or if weights or their record do not fit the release.
     """
-    from wheretolook.training.provenance import was_trained_on
-    from wheretolook.training.weights import preference, read_record, read_training
-
     folder = release.root / "weights"
     fix = f"Run `wheretolook train --config configs/{release.name}.yaml`."
     precision: dict[Path, float] = {}
@@ -136,8 +133,6 @@ def ship_weights(choice: Choice) -> None:
 
     A matchability model stays, because methods that weight landmarks need it. Repeating this changes nothing.
     """
-    from wheretolook.training.weights import read_record
-
     for path in choice.shelved:
         shelf = path.parent / SHELF
         shelf.mkdir(exist_ok=True)
@@ -150,8 +145,6 @@ def ship_weights(choice: Choice) -> None:
 
 def convert_to_float16(path: Path) -> None:
     """Rewrite a weights file in half precision, with the same header; one in half precision stays as it is."""
-    from wheretolook.training.weights import read_weights, write_weights
-
     tensors, header = read_weights(path)
     if any(tensor.is_floating_point() and tensor.element_size() > 2 for tensor in tensors.values()):
         halved = {name: tensor.half() if tensor.is_floating_point() else tensor for name, tensor in tensors.items()}

@@ -13,12 +13,14 @@ dataset; and other accuracies in docs/check.md, which the steps "kitchen" and "f
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
+
+from wheretolook_paper.evaluation.comparison import interval_text
 
 STRICT = "0.05m_0.4deg"
 
@@ -123,7 +125,9 @@ class Numbers:
             return ["–"] * 3
         through = self.scores(file, method, "none")
         return [
-            interval(100 * found[[f"normalized_{end}{STRICT}" for end in ("", "low_", "high_")]]),
+            "{:.1f} [{:.1f}, {:.1f}]".format(
+                *(100 * found[f"normalized_{end}{STRICT}"] for end in ("", "low_", "high_"))
+            ),
             "–" if through is None else f"{100 * through[f'normalized_{STRICT}']:.1f}",
             f"{found['roc_auc']:.3f}",
         ]
@@ -141,7 +145,7 @@ class Numbers:
             row = self._ranked("fisheye", group, method)
             regret = f"{row['regret']:.1f}"
             if method == RANKED[0]:
-                regret = interval(row[["regret", "regret_low", "regret_high"]])
+                regret = interval_text(row, "regret", 1)
             cells.append(f"{regret}; {row['auc']:.3f}" + ("" if pd.isna(row["ece"]) else f"; {row['ece']:.2f}"))
         return cells
 
@@ -150,25 +154,11 @@ class Numbers:
 
     def photographs(self, scene: str) -> Cells:
         def cells(label: str) -> list[str]:
-            found = self.row("photographs.csv", scene=scene, method=METHODS[label])
-            if METHODS[label] == "adapted":
-                return [
-                    f"{found['auc']:.3f}",
-                    "",
-                    f"{found['regret']:.1f}".removesuffix(".0"),
-                    f"{found['ece']:.3f}",
-                    "",
-                ]
-            ends = ("", "_low", "_high")
-            auc, within, regret, ece = (
-                found[[name + end for end in ends]].astype(float)
-                for name in ("auc", "auc_within_blocks", "regret", "ece")
-            )
-            regrets = interval(regret) if regret.any() else "0"
-            calibrated = ["", ""]
-            if not ece.isna().any():
-                calibrated = [interval(ece, 3), f"{found['real_over_expected_localized']:.2f}"]
-            return [interval(auc, 3), interval(within, 3), regrets, *calibrated]
+            row = self.row("photographs.csv", scene=scene, method=METHODS[label])
+            columns = (("auc", 3), ("auc_within_blocks", 3), ("regret", 1), ("ece", 3))
+            found = [_measured(row, name, digits) for name, digits in columns]
+            ratio = row["real_over_expected_localized"]
+            return [*found, "" if pd.isna(ratio) else f"{ratio:.2f}"]
 
         return cells
 
@@ -177,7 +167,7 @@ class Numbers:
         scene = "kitchen" if label.startswith("kitchen") else "fox"
         ours, visible = (self.row("photographs.csv", scene=scene, method=method) for method in ("set", "visible"))
         aucs = (f"{row['auc']:.3f} [{row['auc_low']:.2f}, {row['auc_high']:.2f}]" for row in (ours, visible))
-        above = interval(ours[[f"auc_above_visible{end}" for end in ("", "_low", "_high")]], 3)
+        above = interval_text(ours, "auc_above_visible", 1, 3)
         within = (f"{row['auc_within_blocks']:.3f}" for row in (ours, visible))
         found = f"{ours['real_over_expected_localized']:.2f}"
         return [f"{ours['good']} of {ours['views']}", *aucs, above, *within, f"{ours['ece']:.2f}", found]
@@ -206,8 +196,8 @@ class Numbers:
             apartments = table["scene"].str.startswith("apartment")
             parts = (table[apartments], table[~apartments & (table["scene"] != "all")])
             shares = [100 * (part["localized"] * part["views"]).sum() / part["views"].sum() for part in parts]
-            ends = 100 * everywhere[["localized", "localized_low", "localized_high"]]
-            row = [*(f"{share:.1f}" for share in shares), interval(ends), f"{everywhere['times_forward']:.2f}"]
+            localized = interval_text(everywhere, "localized")
+            row = [*(f"{share:.1f}" for share in shares), localized, f"{everywhere['times_forward']:.2f}"]
             row += [f"{everywhere['times_forward_length']:.2f}", f"{everywhere['turn_deg_per_m']:.0f}°/m"]
             return [*row, f"{everywhere['failures']:.0f} of {everywhere['pairs']:.0f}"]
 
@@ -228,10 +218,14 @@ class Numbers:
         return [*(f"{100 * row['good']:.1f}" for row in rows), f"{100 * rows[-1]['any_good']:.1f}"]
 
 
-def interval(values: Iterable[float], digits: int = 1) -> str:
-    """Format a value and the ends of its interval."""
-    value, low, high = (f"{number:.{digits}f}" for number in values)
-    return f"{value} [{low}, {high}]"
+def _measured(row: Any, name: str, digits: int) -> str:
+    """Format a measure, with its interval where that is known; "" where the measure is unknown."""
+    ends = row[[f"{name}{end}" for end in ("", "_low", "_high")]].astype(float)
+    if pd.isna(ends[name]):
+        return ""
+    if not ends.any():
+        return "0"
+    return f"{ends[name]:.{digits}f}" if ends.isna().any() else interval_text(ends, name, 1, digits)
 
 
 def tables(numbers: Numbers) -> Mapping[tuple[str, str], Cells]:

@@ -19,6 +19,7 @@ from wheretolook.dataset.config import ALL
 from wheretolook.dataset.layout import Dataset
 from wheretolook.dataset.viewpoint_table import UNLABELLED, is_good
 from wheretolook.evaluation.results import SCORES_CSV, best_of, evaluation_params, read_scores, runs_of_rows
+from wheretolook.figures.floor_plan import save_figure
 from wheretolook.scorers.registry import learned
 from wheretolook.tracking import (
     ALL_METHODS,
@@ -26,6 +27,7 @@ from wheretolook.tracking import (
     BEST_TAG,
     REGRET,
     NestedRun,
+    Tags,
     TrackingConfig,
     artifact,
     experiment_ids,
@@ -33,18 +35,22 @@ from wheretolook.tracking import (
     joined,
     log,
     log_history,
-    log_nested,
     start_run,
 )
 from wheretolook.tracking import client as client_of
 from wheretolook.training.provenance import HISTORY_CSV, kept_metrics, params_of
-from wheretolook.utils.files import temporary_folder, write_text
+from wheretolook.utils.files import copy_file, temporary_folder, write_text
 from wheretolook.utils.processes import hold
+from wheretolook_paper.evaluation.comparison import log_comparison
 from wheretolook_paper.evaluation.looks import LOOKS_CSV, log_looks
+from wheretolook_paper.figures.runtimes import runtime_figure, scaling_figure
 from wheretolook_paper.paths.path_report import PATHS_CSV, log_paths
-from wheretolook_paper.release.benchmark_runs import RUNTIMES_CSV, log_runtimes
 from wheretolook_paper.release.card import GENERALIZATION_CSV
 from wheretolook_paper.release.training_histories import TRAINING_CSV, read_histories, records, train_runs
+
+RUNTIMES_CSV = "runtimes.csv"
+SCALING_CSV = "scaling.csv"
+"""Tables of `figures.runtimes`: times at the paper's size, and growth of time and memory."""
 
 LEARNERS_CSV = "learners.csv"
 """In a release's `results/`: metrics of all learners by seed on validation, test and other scenes."""
@@ -171,13 +177,9 @@ def _log_evaluation(
     params = {**params, **choices, "reference": table["reference"].iloc[0]}
     best, first = best_of(table)
     metrics |= {**first, "n_locations": float(table.loc[table["scene"] == ALL, "n_locations"].iloc[0])}
-    tags = {**TAGS, "dataset": params["dataset"], **best}
-    with start_run(tracking, ALL_METHODS, "evaluate", params, tags=tags) as (mlflow, run):
-        log(mlflow, run, metrics=metrics)
-        for path in files:
-            mlflow.log_artifact(run, str(path))
-        log_nested(tracking, run, "evaluate", runs_of_rows(table, params), TAGS)
-    return run
+    about = {"dataset": params["dataset"], **best}
+    nested = runs_of_rows(table, params)
+    return log_comparison(tracking, ALL_METHODS, "evaluate", params, metrics, nested, files, TAGS, about)
 
 
 def _log_training(
@@ -222,17 +224,14 @@ def _log_learners(dataset: Dataset, tracking: TrackingConfig) -> str:
             of_learner.setdefault(joined(learner, source), []).append((numbers[REGRET], numbers[AUC]))
         params = {"dataset": dataset.name, "learner": learner, "trained_on": source, "seed": seed}
         nested.append(NestedRun(joined(learner, source, f"seed {seed}" if seed else ""), params, numbers))
-    tags = dict(TAGS)
+    best = {}
     metrics = {}
     if of_learner:
         means_of = {name: np.mean(numbers, axis=0) for name, numbers in of_learner.items()}
-        tags[BEST_TAG] = min(means_of, key=lambda name: means_of[name][0])
-        metrics = dict(zip((REGRET, AUC), map(float, means_of[tags[BEST_TAG]]), strict=True))
-    with start_run(tracking, "all learners", "learners", {"dataset": dataset.name}, tags=tags) as (mlflow, run):
-        log(mlflow, run, metrics=metrics)
-        mlflow.log_artifact(run, str(path))
-        log_nested(tracking, run, "learners", nested, TAGS)
-    return run
+        best[BEST_TAG] = min(means_of, key=lambda name: means_of[name][0])
+        metrics = dict(zip((REGRET, AUC), map(float, means_of[best[BEST_TAG]]), strict=True))
+    params = {"dataset": dataset.name}
+    return log_comparison(tracking, "all learners", "learners", params, metrics, nested, [path], TAGS, best)
 
 
 def _log_paths(dataset: Dataset, tracking: TrackingConfig) -> str:
@@ -260,3 +259,29 @@ _LOGGED: dict[str, tuple[str, Callable[..., str]]] = {
     "benchmark": (RUNTIMES_CSV, _log_benchmark),
 }
 """File in `results/` of each stage, and the function that logs it."""
+
+
+def log_runtimes(tracking: TrackingConfig, results: Path, tags: Tags = None) -> str:
+    """Log the measured times in a folder as a run of the stage "benchmark" with their figures; return its id.
+
+    `RUNTIMES_CSV` is the table of `runtime_figure`, `SCALING_CSV`, which may be missing, that of `scaling_figure`.
+    """
+    sizes = pd.read_csv(results / RUNTIMES_CSV)
+    scaling = results / SCALING_CSV
+    metrics = {}
+    for row in sizes.dropna(subset="median_s").to_dict("records"):
+        name = f"{row['what']} {row['device'].split(':')[0]} {row['threads']} threads s"
+        metrics["".join(letter for letter in name if letter.isalnum() or letter == " ")] = float(row["median_s"])
+    machines = " + ".join(dict.fromkeys(map(str, sizes["name"])))
+    with (
+        temporary_folder() as folder,
+        start_run(tracking, "visibility check", "benchmark", {"machines": machines}, tags=tags) as (client, run),
+    ):
+        log(client, run, metrics=metrics)
+        copy_file(results / RUNTIMES_CSV, folder / RUNTIMES_CSV)
+        save_figure(runtime_figure(sizes), folder / "runtimes.png")
+        if scaling.is_file():
+            copy_file(scaling, folder / SCALING_CSV)
+            save_figure(scaling_figure(pd.read_csv(scaling)), folder / "visibility-scaling.png")
+        client.log_artifacts(run, str(folder))
+    return run

@@ -30,12 +30,9 @@ from wheretolook.geometry.camera import field_of_view_deg
 from wheretolook.geometry.poses import Float, camera_centers
 from wheretolook.scorers.registry import is_probability
 from wheretolook.training.weights import method_of_weights
-from wheretolook_paper.studies.tables import replace_rows
+from wheretolook_paper.evaluation.comparison import replace_rows
 
-NARROW_DEG = 60
-WIDE_DEG = 95
 LIMITS = 0.05, 0.4  # metres and degrees
-RIGHT = 0.5, 5.0  # metres and degrees within which a pose is not a wrong hypothesis
 SHARES = ("expected-inliers", "visible")  # scores that are shares of a map's landmarks
 SQUARE_M = 1.0  # locations in one square of the floor are resampled together
 DRAWS = 2000
@@ -63,7 +60,7 @@ def scored(root: Path, split: Split, methods: tuple[str, ...], weights: list[Pat
             "square": [f"{scene.name} {x} {y}" for x, y in squares],
             "across": numbers.map(across) if len(across) > 1 else next(iter(across.values())),
             "good": is_good(table, *LIMITS),
-            "right": is_good(table, *RIGHT),
+            "right": is_good(table, 0.5, 5.0),  # within which a pose is not a wrong hypothesis
             "inliers": table["n_inliers"],
             "n_landmarks": len(scene.read_landmarks()),
         }
@@ -76,8 +73,8 @@ def groups(views: pd.DataFrame) -> list[tuple[str, str, pd.DataFrame]]:
     """Return kind, name and views of each scene, and of narrow and wide cameras where scenes have several cameras."""
     found = [(str(part["kind"].iloc[0]), str(name), part) for name, part in views.groupby("scene", sort=False)]
     if views.groupby("scene")["across"].nunique().max() > 1:
-        found.append(("narrow", "narrow cameras", views[views["across"] < NARROW_DEG]))
-        found.append(("wide", "wide cameras", views[views["across"] > WIDE_DEG]))
+        found.append(("narrow", "narrow cameras", views[views["across"] < 60]))
+        found.append(("wide", "wide cameras", views[views["across"] > 95]))
     return found
 
 

@@ -31,6 +31,8 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, get_args
 
+import cv2
+import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 import pycolmap
@@ -49,6 +51,7 @@ from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.evaluation.scoring import score_scenes
 from wheretolook.evaluation.statistics import precision_area, precision_over_coverage
 from wheretolook.features.extractor import KINDS, ExtractorConfig, KeypointExtractor, Keypoints, kind_of
+from wheretolook.figures.floor_plan import save_figure
 from wheretolook.geometry.camera import Camera, camera_of, write_cameras
 from wheretolook.geometry.pose_files import images_text
 from wheretolook.geometry.poses import Float, camera_centers, pose_error
@@ -76,8 +79,6 @@ LABELS = {"aliked": "ALIKED", "disk": "DISK", "opencv": "SIFT"}
 COLORS = {"hloc": "#c44e52", "first": "#8c8c8c", "hypotheses": "#4c72b0", "lightglue": "#55a868"}
 ACCURACIES: Mapping[str, Accuracy] = {"5 cm, 0.4 deg": (0.05, 0.4), "25 cm, 2 deg": (0.25, 2.0)}
 AHEAD_M = 3.0  # of a camera, of the point that decides which images are matched
-MIN_TIMED = 10  # queries of a fold of which hloc's time is stated
-HLOC_ERROR_PX = 12.0  # hloc's default limit of an inlier
 SELECTING = ("set", "bins", "visible", "random")  # methods whose views are the queries in a rendered scene
 DIRECTIONS = 24  # of a location, that they select from
 NO_HLOC = (
@@ -166,8 +167,6 @@ def render_set(source: str, locations: int, images: int, work: Path, workers: in
 
     Raises ConfigError if the source is neither.
     """
-    import cv2
-
     kind, _, seed = source.rpartition("-")
     if Path(source).is_file():
         scenes = ScenesConfig(train=0, test=0, meshes=(MeshSource(Path(source)),))
@@ -229,10 +228,6 @@ def summarize(table: pd.DataFrame) -> pd.DataFrame:
 
 def draw(tables: list[Path], figure: Path, accuracy: str = "5 cm, 0.4 deg") -> None:
     """Draw precision over coverage of the poses in tables of `main`: a panel for each set and features."""
-    import matplotlib.pyplot as plt
-
-    from wheretolook.figures.floor_plan import save_figure
-
     table = pd.concat([pd.read_csv(path) for path in tables], ignore_index=True)
     limit_m, limit_deg = ACCURACIES[accuracy]
     table["right"] = (table["error_m"] <= limit_m) & (table["error_deg"] <= limit_deg)
@@ -401,7 +396,8 @@ def _by_hloc(fold: Fold, features: str, retrieved: Mapping[str, Sequence[str]]) 
 
     model = pycolmap.Reconstruction(fold.model)
     number_of = {image.name: number for number, image in model.images.items()}
-    localizer = localize_sfm.QueryLocalizer(model, {"estimation": {"ransac": {"max_error": HLOC_ERROR_PX}}})
+    # hloc's default limit of an inlier
+    localizer = localize_sfm.QueryLocalizer(model, {"estimation": {"ransac": {"max_error": 12.0}}})
     camera = pycolmap.Camera(**fold.camera.colmap.record())
     matches = fold.folder / "query-matches.h5"
     pairs = fold.folder / "query-pairs.txt"
@@ -410,7 +406,7 @@ def _by_hloc(fold: Fold, features: str, retrieved: Mapping[str, Sequence[str]]) 
     start = time.perf_counter()
     match_features.main(match_features.confs[MATCHERS[features]], pairs, fold.features, matches=matches)
     # of few queries most of the time is that of loading the matcher
-    matching = (time.perf_counter() - start) / len(retrieved) if len(retrieved) >= MIN_TIMED else np.nan
+    matching = (time.perf_counter() - start) / len(retrieved) if len(retrieved) >= 10 else np.nan
     poses = {}
     for query, images in tqdm(retrieved.items(), desc="hloc"):
         start = time.perf_counter()

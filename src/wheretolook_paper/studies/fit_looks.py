@@ -27,7 +27,7 @@ from wheretolook.looks import selection as set_score
 from wheretolook.looks.selection import candidate_views, log_position_variance
 from wheretolook.scorers.weights import load_scorer
 from wheretolook.utils.package import WEIGHTS, shipped
-from wheretolook_paper.evaluation.joint_labels import label_sets
+from wheretolook_paper.evaluation.looks import label_sets
 
 VARIANCE = 0.375  # weight of the log of the position's variance, relative to the log-odds
 SURE = 0.99

@@ -55,11 +55,10 @@ from wheretolook.mapping.triangulation import (
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.processes import WorkerPool
 from wheretolook.utils.texts import quiet_colmap
-from wheretolook_paper.studies.tables import replace_rows
+from wheretolook_paper.evaluation.comparison import replace_rows
 
 FOCAL_PX = 525.0  # initial focal length of photographs with poses
 PARTNERS = 20  # that each photograph with a pose is matched with
-ROUNDS = 3  # of triangulation and bundle adjustment
 MAP = MapConfig()
 ACCURACIES_CSV = "photograph_accuracies.csv"
 ACCURACIES = (0.25, 2.0), (0.5, 5.0)  # metres and degrees, beside that of the weights
@@ -124,7 +123,7 @@ def map_known_poses(folder: Path, work: Path, extractor: ExtractorConfig, worker
     with quiet_colmap("ERROR"):
         matcher = pycolmap.GeometricVerifierOptions(num_threads=1)
         pycolmap.geometric_verification(str(database), matcher, two_view_geometry_options=verification)
-        for _ in tqdm(range(ROUNDS), "map: adjust", unit="round"):
+        for _ in tqdm(range(3), "map: adjust", unit="round"):  # of triangulation and bundle adjustment
             adjusted = dict(enumerate(colmap_poses(work, model)))
             model = triangulate(posed_model(model.cameras[1], names, adjusted, stored), database)
             adjusting = pycolmap.BundleAdjustmentConfig()

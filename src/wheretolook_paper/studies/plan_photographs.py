@@ -45,14 +45,14 @@ from wheretolook.planning.rrt import Space
 from wheretolook.planning.scene_map import path_views, plan_by_methods, scene_scorer
 from wheretolook.scorers.weights import resolve_weights
 from wheretolook.utils.errors import PlanningError
-from wheretolook_paper.figures.photograph_paths import (
+from wheretolook_paper.evaluation.comparison import replace_rows
+from wheretolook_paper.figures.paths import (
     AXIS,
     LANDMARKS_CSV,
     POSITION,
     photograph_paths_figure,
     photograph_paths_markdown,
 )
-from wheretolook_paper.studies.tables import replace_rows
 
 GRID = (8, 8, 4)
 DIRECTIONS = 200

@@ -29,12 +29,12 @@ from wheretolook.utils.devices import usable_device
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.files import copy_file, read_json_object, sha256, write_json, write_text
 from wheretolook.utils.package import VERSION
+from wheretolook_paper.evaluation.comparison import replace_rows
 from wheretolook_paper.evaluation.looks import LOOKS_CSV
 from wheretolook_paper.paths.path_report import PATHS_CSV, pooled_paths
-from wheretolook_paper.release.benchmark_runs import RUNTIMES_CSV
 from wheretolook_paper.release.card import GENERALIZATION_CSV, GENERALIZATION_MD
 from wheretolook_paper.release.numbers import Numbers, pages, updated
-from wheretolook_paper.studies.tables import replace_rows
+from wheretolook_paper.release.runs import RUNTIMES_CSV
 
 RELEASE = Path("data/release")
 RESULTS = RELEASE / "results"
@@ -147,7 +147,7 @@ def steps(
         ),
         **{
             f"paths-{scene}": Step(
-                [*mapped("test-90"), run("compare-paths", "test-90", "--paths.scenes", f"[{scene}]")],
+                [*mapped("test-90"), run("compare-paths", "test-90", "--in-scenes", f"[{scene}]")],
                 (SET,),
                 _paths,
                 "meshes",

@@ -16,8 +16,8 @@ from wheretolook.mapping.rendered_map import plan_walk
 from wheretolook.mapping.triangulation import posed_model
 from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.scenes.loading import load_mesh, save_glb
-from wheretolook_paper.benchmark.folder import CAMERA, DRAWN_CAMERA, BenchmarkScene
-from wheretolook_paper.benchmark.query_map import build_query_map
+from wheretolook_paper.benchmark.files import CAMERA, DRAWN_CAMERA, BenchmarkScene
+from wheretolook_paper.benchmark.round import build_query_map
 
 IDS = (*map(str, range(1, 13)),)  # file names sort differently: 1, 10, 11, 12, 2
 

@@ -18,8 +18,7 @@ from wheretolook.geometry.poses import camera_centers, pose_error
 from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.scenes.loading import load_mesh
 from wheretolook.utils.errors import MapError, SceneError, TableError, WhereToLookError
-from wheretolook_paper.benchmark.files import read_errors, read_poses
-from wheretolook_paper.benchmark.folder import DRAWN_CAMERA, BenchmarkScene
+from wheretolook_paper.benchmark.files import DRAWN_CAMERA, BenchmarkScene, read_errors, read_poses
 from wheretolook_paper.benchmark.round import RoundConfig, SceneRound
 
 pytestmark = pytest.mark.slow

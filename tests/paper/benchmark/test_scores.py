@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.utils.errors import TableError
 from wheretolook_paper.benchmark.files import read_errors, read_poses, write_errors, write_poses
-from wheretolook_paper.benchmark.report import Result, summary_table, summary_text
-from wheretolook_paper.benchmark.scores import PLAN, Scores
+from wheretolook_paper.benchmark.report import PLAN, Result, Scores, summary_table, summary_text
 
 YAWS = (0, 25, 50, 90, 100, 100, 100, 100, 100, 100, 100)  # the fourth view is 40 degrees from the third
 ERRORS = {  # metres and degrees of each id

@@ -20,8 +20,7 @@ from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.tracking import TrackingConfig, newest_run
 from wheretolook.utils.errors import ConfigError, PoseError, TableError
 from wheretolook_paper.commands.reports import LookConfig, evaluate_look_sets
-from wheretolook_paper.evaluation.joint_labels import SET_COLUMNS, label_sets
-from wheretolook_paper.evaluation.looks import look_table, stopping_table
+from wheretolook_paper.evaluation.looks import SET_COLUMNS, label_sets, look_table, stopping_table
 
 WEIGHTS = Path(__file__).parents[3] / "data" / "release" / "weights" / "set.safetensors"
 

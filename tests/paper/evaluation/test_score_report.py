@@ -10,8 +10,7 @@ import pytest
 
 from synthetic_scores import KEYS, make_scores
 from wheretolook.evaluation.results import main_rows
-from wheretolook_paper.evaluation.comparisons import comparisons_markdown
-from wheretolook_paper.evaluation.score_report import score_markdown
+from wheretolook_paper.evaluation.score_report import comparisons_markdown, score_markdown
 
 FINEST = KEYS[0]
 
@@ -67,6 +66,8 @@ def test_occlusion_models_and_candidates_are_compared(scores: pd.DataFrame) -> N
     fewer = fewer[fewer["method"] != "mlp-2d"]
     everything = pd.concat([scores, fewer, other])
     pd.testing.assert_frame_equal(main_rows(everything), scores)
+    photographs = make_scores(seed=3).assign(candidates="photographs")
+    assert "## Photographs" in score_markdown(pd.concat([scores, photographs]))
     report = comparisons_markdown(everything)
     for heading, value, table in (("By occlusion", "none", other), ("By set of candidates", "best 100", fewer)):
         row = one_row(table, "random")

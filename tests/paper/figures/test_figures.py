@@ -18,11 +18,10 @@ from wheretolook.evaluation.statistics import calibration_rows
 from wheretolook.geometry.lattices import fibonacci_sphere
 from wheretolook.geometry.poses import pan_tilt_angles
 from wheretolook_paper.evaluation.label_report import label_summary
-from wheretolook_paper.figures.calibration import calibration_figure
 from wheretolook_paper.figures.dollhouse import dollhouse
 from wheretolook_paper.figures.labels import SHADES, label_figure
 from wheretolook_paper.figures.overview import Overview, View, overview_figure
-from wheretolook_paper.figures.scores import regret_figure, score_figure
+from wheretolook_paper.figures.scores import calibration_figure, regret_figure, score_figure
 from wheretolook_paper.styles import method_style
 
 

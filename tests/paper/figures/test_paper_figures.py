@@ -15,11 +15,11 @@ from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.lattices import fibonacci_sphere, released_lattice
 from wheretolook.geometry.poses import poses_looking_along
 from wheretolook_paper.figures.dollhouse import dollhouse
-from wheretolook_paper.figures.lattices import covering_radius_deg, fibonacci_figure, nearest_angles_deg
-from wheretolook_paper.figures.look_story import Estimate, LookStory, film_frames, story_figure
-from wheretolook_paper.figures.peaks import spread_extrema
+from wheretolook_paper.figures.looks import Estimate, LookStory, film_frames, story_figure
+from wheretolook_paper.figures.network import spread_extrema
 from wheretolook_paper.figures.runtimes import scaling_figure, step_table
-from wheretolook_paper.figures.training import training_figure
+from wheretolook_paper.figures.sampling import covering_radius_deg, fibonacci_figure, nearest_angles_deg
+from wheretolook_paper.figures.scores import training_figure
 
 RNG = np.random.default_rng(0)
 CAMERA = PinholeCamera(64, 48, 32.0)

@@ -15,7 +15,7 @@ from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.geometry.views import Views
 from wheretolook.utils.errors import ConfigError
 from wheretolook_paper.figures.animation import save_moving
-from wheretolook_paper.figures.path_film import FRAME_MS, film_frames, still_figure
+from wheretolook_paper.figures.paths import FRAME_MS, film_frames, still_figure
 
 RNG = np.random.default_rng(1)
 LANDMARKS = RNG.uniform((0, 0, 0), (4, 3, 2), (300, 3))

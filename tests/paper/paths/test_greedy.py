@@ -8,7 +8,7 @@ import numpy as np
 
 from wheretolook.geometry.lattices import direction_lattice
 from wheretolook.planning.view_sequence import TurnLimit, best_sequence
-from wheretolook_paper.paths.greedy import greedy_sequence, resample_path
+from wheretolook_paper.paths.path_comparison import greedy_sequence, resample_path
 
 
 def test_greedy_rule_is_actlocs() -> None:

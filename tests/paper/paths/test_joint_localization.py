@@ -13,10 +13,12 @@ from wheretolook.dataset.viewpoint_table import pose_columns
 from wheretolook.geometry.poses import pose_error, poses_looking_along
 from wheretolook.localization.estimation import PoseEstimator
 from wheretolook.planning.config import StopConfig
-from wheretolook_paper.evaluation.joint_labels import label_sets
+from wheretolook_paper.evaluation.looks import label_sets
 from wheretolook_paper.figures.paths import paths_figure
 from wheretolook_paper.paths.config import PathsConfig
-from wheretolook_paper.paths.joint_localization import (
+from wheretolook_paper.paths.path_comparison import ComparedPaths
+from wheretolook_paper.paths.path_report import path_markdown, summarize_paths
+from wheretolook_paper.paths.scene_comparison import (
     OUTCOME,
     chained,
     joint_paths,
@@ -25,8 +27,6 @@ from wheretolook_paper.paths.joint_localization import (
     noisy_steps,
     rig_of_last,
 )
-from wheretolook_paper.paths.path_comparison import ComparedPaths
-from wheretolook_paper.paths.path_report import path_markdown, summarize_paths
 
 LANDMARKS = room_landmarks(900)
 POSITIONS = np.linspace((1.0, 0.9, 1.3), (3.0, 0.9, 1.3), 6)

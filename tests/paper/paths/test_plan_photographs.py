@@ -14,9 +14,9 @@ from wheretolook.holdout.photo_map import features_of, open_map
 from wheretolook.mapping.config import FrameOptions
 from wheretolook.space.free_space import MappedSpace
 from wheretolook.utils.errors import PlanningError
-from wheretolook_paper.figures.photograph_paths import AXIS, LANDMARKS_CSV, PATHS_CSV, POSITION
+from wheretolook_paper.evaluation.comparison import replace_rows
+from wheretolook_paper.figures.paths import AXIS, LANDMARKS_CSV, PATHS_CSV, POSITION
 from wheretolook_paper.studies.plan_photographs import farthest_ends, main, nearest_photographs
-from wheretolook_paper.studies.tables import replace_rows
 
 
 def test_the_nearest_photograph_weighs_the_angle_against_the_distance_in_depths() -> None:

@@ -16,12 +16,11 @@ from wheretolook.dataset.config import ALL
 from wheretolook.dataset.layout import Dataset
 from wheretolook.planning.config import PathConfig, PlanConfig
 from wheretolook.tracking import TrackingConfig, newest_artifact, newest_run
-from wheretolook_paper.figures.config import FiguresConfig
-from wheretolook_paper.figures.top_n import ROWS, top_n_figure, top_n_table
+from wheretolook_paper.commands.figures import FiguresConfig
+from wheretolook_paper.figures.scores import ROWS, top_n_figure, top_n_table
 from wheretolook_paper.release.catalog import ITEMS, write_items
 from wheretolook_paper.release.runs import log_release
-from wheretolook_paper.release.showcase import open_showcase
-from wheretolook_paper.release.showcase_figures import planned_views
+from wheretolook_paper.release.showcase import open_showcase, planned_views
 from wheretolook_paper.styles import method_style
 
 RELEASE = Path(__file__).parents[3] / "data" / "release"

@@ -32,8 +32,7 @@ from wheretolook.utils.errors import ConfigError, SceneError
 from wheretolook.visibility.config import OcclusionConfig
 from wheretolook.visibility.occlusion import MeshOcclusion
 from wheretolook_paper.figures.overview import outcome_in_words
-from wheretolook_paper.release.showcase import Showcase, open_showcase
-from wheretolook_paper.release.showcase_figures import learning_of, peaks_of, pipeline_of
+from wheretolook_paper.release.showcase import Showcase, learning_of, open_showcase, peaks_of, pipeline_of
 from wheretolook_rooms.generator import generate_apartment
 
 CAMERA = PinholeCamera(96, 72, 48.0)

@@ -17,7 +17,7 @@ from wheretolook.visibility.frustum import LandmarkSets, PosedViews
 from wheretolook.visibility.occlusion import StoredOcclusion
 from wheretolook_paper.fisher.exact import exact_information_plain
 from wheretolook_paper.fisher.metrics import METRICS
-from wheretolook_paper.scorers.fisher import APPROXIMATIONS, Approximation
+from wheretolook_paper.scorers.fisher import Approximation
 from wheretolook_paper.scorers.fisher.score import FisherScorer, StationaryTraceScorer, WorstTraceScorer
 
 CAMERA = PinholeCamera()
@@ -41,7 +41,7 @@ def views_at(locations: Float, directions: Float = DIRECTIONS) -> Float:
 
 
 @pytest.mark.parametrize("metric", METRICS)
-@pytest.mark.parametrize("approximation", APPROXIMATIONS)
+@pytest.mark.parametrize("approximation", ["exact", "quadratic", "gp"])
 def test_of_a_room_with_landmarks_on_two_walls_it_looks_at_them(metric: str, approximation: Approximation) -> None:
     rng = np.random.default_rng(1)
     localization_map = LocalizationMap(Map(two_walls(rng)), CAMERA)

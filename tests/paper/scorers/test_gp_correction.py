@@ -7,10 +7,20 @@ from scipy.special import expit
 from sklearn.gaussian_process import GaussianProcessClassifier
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel
 
-from localized_views import random_views
 from wheretolook.geometry.lattices import fibonacci_sphere
 from wheretolook.scorers.adapted.calibration import PRIOR, LocalizedViews, log_losses
 from wheretolook_paper.scorers.gp_correction import Correction, adapt, fit, nearness
+
+
+def random_views(n_locations=30, n_directions=12, seed=0, shift=0.0):
+    """Views of a 6 x 6 m room; in one half of it those that look along +x do not localize, whatever a scorer thinks."""
+    rng = np.random.default_rng(seed)
+    centers = np.repeat(rng.uniform((-3, -3, 0.5), (3, 3, 2), (n_locations, 3)), n_directions, axis=0)
+    axes = np.tile(fibonacci_sphere(n_directions), (n_locations, 1))
+    log_odds = rng.normal(0, 2, len(centers))
+    wrong = (centers[:, 0] > 0) & (axes[:, 0] > 0)
+    good = rng.random(len(centers)) < expit(np.where(wrong, -4, log_odds) + shift)
+    return LocalizedViews.rendered(log_odds, good, centers, axes, np.repeat(np.arange(n_locations), n_directions))
 
 
 def test_the_correction_is_scikit_learns_gaussian_process() -> None:

@@ -17,6 +17,7 @@ from wheretolook.dataset.viewpoint_table import is_good, poses
 from wheretolook.scorers.weights import load_scorer
 from wheretolook.tracking import TrackingConfig
 from wheretolook.training.weights import method_of_weights, read_training
+from wheretolook.utils.errors import ConfigError
 from wheretolook_paper.scorers.pooled_features import POOLED
 from wheretolook_paper.scorers.trees import TreesConfig
 from wheretolook_paper.scorers.trees.learn import BoostedTrees, PooledViews, fit_trees, load_pooled
@@ -73,3 +74,17 @@ def test_the_scorer_is_the_trees_on_pooled_views(tmp_path: Path) -> None:
     wide = localization_map.of_camera(replace(dataset.camera, focal_px=dataset.camera.focal_px / 2))
     assert scorer.in_range(poses(table)).mean() > 0.9
     assert not load_scorer(wide, model.path).in_range(poses(table)).any()
+
+
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [
+        ("conv", {"widths": ()}),
+        ("conv", {"dropout": 1.0}),
+        ("sphere", {"width": 30, "heads": 4}),
+        ("trees", {"max_leaves": 1}),
+    ],
+)
+def test_invalid_options(name: str, options: dict[str, object]) -> None:
+    with pytest.raises(ConfigError):
+        train_config(**{name: options})

@@ -13,7 +13,6 @@ from scipy.special import expit, logit
 from wheretolook.geometry.poses import Float
 
 PRIOR = np.array([5.0, 0.1])  # precision of scale (about 1) and offset (about 0)
-FOLDS = 5
 MIN_SCALE = 1e-3  # of log-odds: 0 or less would reverse the order of the views
 
 
@@ -51,12 +50,12 @@ class LocalizedViews:
 
     def joined(self, other: LocalizedViews) -> LocalizedViews:
         """Return these views and others of the same scene, with separate groups and locations."""
-        parts = []
+        parts = {}
         for part in fields(self):
             values = getattr(self, part.name)
             shift = int(values.max()) + 1 if part.name in ("group", "place") and len(self) else False
-            parts.append(np.concatenate([values, getattr(other, part.name) + shift]))
-        return LocalizedViews(*parts)
+            parts[part.name] = np.concatenate([values, getattr(other, part.name) + shift])
+        return LocalizedViews(**parts)
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,11 +94,11 @@ def adapt(views: LocalizedViews, seed: int = 0) -> Adapted:
 def splits(views: LocalizedViews, seed: int = 0) -> Iterator[tuple[NDArray[np.bool_], LocalizedViews]]:
     """Yield held-out views (B,), each view once, and the training views.
 
-    Groups are held out in `FOLDS` parts; those of photographs alone, one after the other. A held-out photograph is not
+    Groups are held out in five parts; those of photographs alone, one after the other. A held-out photograph is not
     in the training views, whatever its group.
     """
     names, row = np.unique(views.group, return_inverse=True)
-    n_folds = FOLDS if (views.photograph < 0).any() else len(views)
+    n_folds = 5 if (views.photograph < 0).any() else len(views)
     order = np.random.default_rng(seed).permutation(len(names))
     fold = order[row.reshape(-1)] % min(n_folds, max(2, len(names)))
     for number in np.unique(fold):

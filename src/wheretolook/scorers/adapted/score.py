@@ -23,8 +23,6 @@ from wheretolook.scorers.set.score import SetScorer
 from wheretolook.training.trained_network import StoredNetwork, TrainedNetwork, finite
 from wheretolook.utils.errors import WeightsError
 
-MAX_PLACE = 1_000_000  # landmarks: more are no weights of this program
-
 
 class AdaptedNetwork(StoredNetwork):
     """A set network and its calibration.
@@ -55,26 +53,22 @@ class AdaptedNetwork(StoredNetwork):
             )
         base = stored["base"]
         place = int(stored["place"])
-        if not 0 <= place <= MAX_PLACE:
+        if not 0 <= place <= 1_000_000:  # more are no weights of this program
             raise ValueError(f"invalid number of landmarks {place}")
         network = SetNetwork.of_description(base["network"])
         return cls(network, finite(base["scale"]), finite(base["offset"]), place)
 
 
-SAME_M = 0.05
 MIN_SHARE = 0.5
-"""A map is of the scene if this share of the stored landmarks has one of the map's within this distance. A map with
-other filters, or reconstructed again in the same frame, still is."""
+"""A map is of the scene if this share of the stored landmarks has one of the map's within 5 cm. A map with other filters,
+or reconstructed again in the same frame, still is."""
 
 
 def share_of_place(place: Float, landmarks: Float) -> float:
     """Return the share of stored landmarks (P, 3) m that a map's landmarks (N, 3) m contain; 1 if none are stored."""
     if len(place) == 0:
         return 1.0
-    return float((cKDTree(landmarks).query(place)[0] <= SAME_M).mean()) if len(landmarks) else 0.0
-
-
-MIN_DISTANCE = 1e-12  # of probabilities from 0 and 1, so that their log-odds are finite
+    return float((cKDTree(landmarks).query(place)[0] <= 0.05).mean()) if len(landmarks) else 0.0
 
 
 def adapted_scorer(localization_map: LocalizationMap, options: BuildOptions) -> Scorer:
@@ -101,10 +95,14 @@ class AdaptedScorer(Scorer):
         super().__init__(localization_map)
         network = trained.network
         self.trained = trained
-        of_base = network.network, trained.camera, network.base_scale, network.base_offset, trained.training_range
         rendered = replace(localization_map.map, has_photographs=False)
         known = replace(localization_map, map=rendered)  # the base is calibrated for this map already
-        self.base = SetScorer(known, TrainedNetwork("set", *of_base))
+        self.base = SetScorer(
+            known,
+            TrainedNetwork(
+                "set", network.network, trained.camera, network.base_scale, network.base_offset, trained.training_range
+            ),
+        )
 
     def score(self, cam_from_world: Float) -> Float:
         """Return probabilities (B,) in [0, 1]."""
@@ -129,4 +127,4 @@ class AdaptedScorer(Scorer):
 
 def log_odds_of(probability: Float) -> Float:
     """Return finite log-odds of probabilities in [0, 1]."""
-    return finite_log_odds(probability, MIN_DISTANCE)
+    return finite_log_odds(probability, 1e-12)

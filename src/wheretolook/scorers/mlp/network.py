@@ -223,10 +223,16 @@ class ViewpointNetwork(BinnedNetwork):
     @classmethod
     def of_description(cls, stored: Mapping[str, Any]) -> ViewpointNetwork:
         """Build the untrained network of a description; ValueError if it names an unknown channel."""
-        bins = int(stored["bins"])
-        hidden = tuple(stored["hidden"])
-        dropouts = float(stored["dropout"]), float(stored["input_dropout"])
-        return cls(NetworkSpec(statistics_of_record(stored), bins, stored["layout"], hidden, *dropouts))
+        return cls(
+            NetworkSpec(
+                statistics_of_record(stored),
+                int(stored["bins"]),
+                stored["layout"],
+                tuple(stored["hidden"]),
+                float(stored["dropout"]),
+                float(stored["input_dropout"]),
+            )
+        )
 
     @property
     def stored(self) -> nn.Module:

@@ -45,8 +45,6 @@ class LogError:
 STATISTICS = ("log_visible", "log_orientation_variance", "log_expected_cells")
 """Features of the errors. None depends on the unit of length: errors scale with the deviation of the position."""
 
-FEATURES = [VIEW_STATISTICS.index(name) for name in (*STATISTICS, "log_position_variance")]
-ORIENTATION = VIEW_STATISTICS.index("log_orientation_variance")
 MARGIN = 1e-5  # of probabilities from 0 and 1, so that their log-odds are finite
 
 
@@ -89,14 +87,16 @@ class AccuracyModel(LogisticRegression):
         """Return P(right place) (B,) of views with the network's probabilities (B,) and `VIEW_STATISTICS` (B, S)."""
         finite = xp.clip(own, MARGIN, 1 - MARGIN)
         of_odds, of_variance = self.weights
-        log_odds = of_odds * xp.log(finite / (1 - finite)) + of_variance * statistics[:, ORIENTATION] + self.bias
+        variance = statistics[:, VIEW_STATISTICS.index("log_orientation_variance")]
+        log_odds = of_odds * xp.log(finite / (1 - finite)) + of_variance * variance + self.bias
         return 1 / (1 + xp.exp(-log_odds))
 
     def log_errors(self, statistics: Any, xp: Any = np) -> Any:
         """Return the means (B, 2) of the logs of the errors (m, degrees) at the right place."""
         weights = np.array([(*error.weights, power) for error, power in zip(self.errors, (0.5, 0.0), strict=True)])
         biases = np.array([error.bias for error in self.errors])
-        return statistics[:, FEATURES] @ xp.asarray(weights.T) + xp.asarray(biases)
+        columns = [VIEW_STATISTICS.index(name) for name in (*STATISTICS, "log_position_variance")]
+        return statistics[:, columns] @ xp.asarray(weights.T) + xp.asarray(biases)
 
     def expected_errors(self, statistics: Float) -> Float:
         """Return the expected errors (B, 2) at the right place, in metres and degrees."""

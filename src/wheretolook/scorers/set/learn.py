@@ -28,8 +28,8 @@ class SingleLandmarkBatches(IndexBatches):
     The scenes of shuffled landmarks are scaled as by `LandmarkBatches`.
     """
 
-    def __init__(self, values: Tensor, detected: Tensor, rows: Tensor, *options: Any, max_scale: float = 1.0) -> None:
-        super().__init__(rows.to(values.device), *options)
+    def __init__(self, values: Tensor, detected: Tensor, rows: Tensor, max_scale: float = 1.0, **order: Any) -> None:
+        super().__init__(rows.to(values.device), **order)
         self.values = values
         self.detected = detected
         self.max_scale = max_scale
@@ -66,8 +66,15 @@ class MatchabilityDataModule(LandmarkDataModule):
         """See `ViewsDataModule.batches`."""
         assert self.views.detected is not None
         size = self.options.batch_size * self.options.landmarks * (8 if shuffle_seed is None else 1)
-        data = (self.views.values, self.views.detected, self.entries(rows))
-        return SingleLandmarkBatches(*data, size, shuffle_seed, self.share, max_scale=self.options.enlarged)
+        return SingleLandmarkBatches(
+            self.views.values,
+            self.views.detected,
+            self.entries(rows),
+            self.options.enlarged,
+            batch_size=size,
+            shuffle_seed=shuffle_seed,
+            share=self.share,
+        )
 
 
 def learn_matchability(task: TrainingJob) -> TrainingResult:
@@ -80,9 +87,6 @@ def learn_matchability(task: TrainingJob) -> TrainingResult:
 
 
 WINDOWS = 2  # landmarks stored of a view, over those in a training step's window
-MIN_BATCHES = 16  # that the training views are cut into
-MIN_BATCH_SIZE = 64
-MIN_STEPS = 600  # of all epochs
 
 
 class SetDataModule(LandmarkDataModule):
@@ -96,17 +100,27 @@ class SetDataModule(LandmarkDataModule):
     def batches(self, rows: Tensor, shuffle_seed: int | None = None) -> LandmarkBatches:
         """Return shuffled views, every time with other windows; or views in order, always with all landmarks stored."""
         width = self.options.landmarks * (WINDOWS if shuffle_seed is None else 1)
-        order = self.options.batch_size, shuffle_seed, self.share
-        scaling = {"max_scale": self.options.enlarged, "max_error_m": self.config.max_error_m}
-        return LandmarkBatches(self.views, rows, width, *order, **scaling)
+        return LandmarkBatches(
+            self.views,
+            rows,
+            width,
+            self.options.batch_size,
+            shuffle_seed,
+            self.share,
+            max_scale=self.options.enlarged,
+            max_error_m=self.config.max_error_m,
+        )
 
 
 def of_size(options: SetConfig, n_train: int) -> SetConfig:
-    """Return options with smaller batches and more epochs if there are few training views."""
-    batch_size = min(options.batch_size, max(MIN_BATCH_SIZE, n_train // MIN_BATCHES))
-    enough = ceil(MIN_STEPS / ceil(n_train / batch_size))
-    if n_train // MIN_BATCHES >= options.batch_size:
+    """Return options with smaller batches and more epochs if there are few training views.
+
+    These are cut into 16 batches, of 64 views at least, and all epochs have 600 steps at least.
+    """
+    if n_train // 16 >= options.batch_size:
         return options
+    batch_size = min(options.batch_size, max(64, n_train // 16))
+    enough = ceil(600 / ceil(n_train / batch_size))
     return replace(options, batch_size=batch_size, epochs=max(options.epochs, enough))
 
 

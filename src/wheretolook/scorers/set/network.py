@@ -20,9 +20,6 @@ from wheretolook.scorers.set import SetConfig
 from wheretolook.training.trained_network import StoredNetwork
 from wheretolook.utils.errors import WeightsError
 
-INITIAL_LOG_ODDS = -2.0  # of detection, by an untrained network: about one in eight, as in real views
-REQUIRED = ("across", "down", "distance", "pixel_angle", "pixel_size_ratio")  # attributes that locate a landmark
-
 
 class LandmarkNetwork(StoredNetwork):
     """A network over single landmarks, whose inputs are the attributes named by its statistics, in that order.
@@ -48,7 +45,7 @@ class LandmarkNetwork(StoredNetwork):
         Raises a ValueError if it names an attribute that this version's maps lack, or none that locates a landmark.
         """
         names = tuple(stored["attributes"])
-        if missing := {*REQUIRED} - {*names}:
+        if missing := {"across", "down", "distance", "pixel_angle", "pixel_size_ratio"} - {*names}:
             raise ValueError(f"the attribute {min(missing)}, which locates a landmark, is missing")
         options = {name: tuple(x) if isinstance(x, list) else x for name, x in stored["options"].items()}
         return cls(FeatureStatistics.of_record(names, stored["statistics"], ATTRIBUTES), **options)
@@ -80,7 +77,7 @@ class MatchabilityNetwork(LandmarkNetwork):
         super().__init__(statistics, width=width, hidden=hidden)
         self.input = StandardAttributes(statistics, hidden)
         last = nn.Linear(width, 1)
-        nn.init.constant_(last.bias, INITIAL_LOG_ODDS)
+        nn.init.constant_(last.bias, -2.0)  # log-odds of detection, about one in eight, as in real views
         self.layers = nn.Sequential(
             nn.Linear(len(self.attributes), width), nn.ReLU(), nn.Linear(width, width), nn.ReLU(), last
         )
@@ -90,16 +87,13 @@ class MatchabilityNetwork(LandmarkNetwork):
         return self.layers(self.input(values)).squeeze(-1)
 
 
-REFERENCE_FOCAL_PX = 320.0
-"""A pixel of this focal length is the unit of a bearing's noise, so information does not depend on image sizes."""
-
-
 def bearing_precision(values: Tensor, attributes: tuple[str, ...] = ATTRIBUTES) -> Tensor:
     """Return one over the variance of each landmark's bearing (...), from attributes (..., A).
 
-    A keypoint is off by a pixel of the camera, and the landmark by what a pixel of the mapping images covers.
+    A keypoint is off by a pixel of the camera, and the landmark by what a pixel of the mapping images covers. The unit
+    is a pixel of a focal length of 320 pixels, so information does not depend on image sizes.
     """
-    pixel = values[..., attributes.index("pixel_angle")] + log(REFERENCE_FOCAL_PX)
+    pixel = values[..., attributes.index("pixel_angle")] + log(320)
     ratio = values[..., attributes.index("pixel_size_ratio")].nan_to_num(nan=0.0)
     return (-2 * pixel).exp() / (1 + (-2 * ratio).exp())
 

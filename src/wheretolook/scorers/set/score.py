@@ -47,11 +47,6 @@ OF_LOCATION = ("distance", "mapped_angle", "distance_ratio", "pixel_size_ratio")
 OF_IMAGE = ("across", "down")
 """Attributes of a landmark that depend on the camera's orientation."""
 
-AT_ONCE = {"cpu": 1 << 13, "cuda": 1 << 22}  # visible landmarks in a block: fits the cache, or takes 2 GB
-NEARBY = {"cpu": 1, "cuda": 1 << 23}  # landmarks times locations in a block; of one location at least
-SCRATCH_BYTES = 1 << 24
-MIN_CELLS = 64  # along a side of the sphere's map: of larger cells too many are on the border of a view
-
 
 class BatchedDirections:
     """Scores the same directions (D, 3), unit vectors in the world, at any location.
@@ -111,7 +106,8 @@ class BatchedDirections:
         """Return scores (L, D) at locations (L, 3) m; a PoseError if one is not finite."""
         locations = check_locations(locations)
         scores = np.empty((len(locations), len(self.rotations)))
-        step = max(1, NEARBY[self.device.type] // max(1, len(self.points)))
+        # landmarks times locations in a block
+        step = 1 if self.device.type == "cpu" else max(1, (1 << 23) // max(1, len(self.points)))
         blocks = [slice(begin, begin + step) for begin in range(0, len(locations), step)]
 
         def work(rows: slice) -> None:
@@ -160,12 +156,14 @@ class BatchedDirections:
 
     def _lister(self, level: int) -> FrustumLister:
         """The lister for every 2^level-th landmark. Few landmarks share one: to make its cells takes 70 ms of a core."""
-        size = max(MIN_CELLS, choose_size(len(self.points) >> level))
+        # 64 at least: of larger cells too many are on the border of a view
+        size = max(64, choose_size(len(self.points) >> level))
         with self._lock:
             if size not in self._listers:
                 camera = self.localization_map.camera
-                options = {"scratch_bytes": SCRATCH_BYTES, "size": size}
-                self._listers[size] = FrustumLister(camera, self.rotations, 0, self.points.device, **options)
+                self._listers[size] = FrustumLister(
+                    camera, self.rotations, 0, self.points.device, size=size, scratch_bytes=1 << 24
+                )
             return self._listers[size]
 
     def _of_listed(self, listed: ListedViews, nearby: Surroundings, stride: int, n_visible: Float) -> Float:
@@ -183,7 +181,8 @@ class BatchedDirections:
         cells = torch.zeros(len(n_visible), device=self.device)
         visible = torch.from_numpy(n_visible).to(sums)
         each = visible / torch.from_numpy(np.diff(starts)).to(self.device).clamp(min=1)
-        for views in ragged_blocks(starts, AT_ONCE[self.device.type]):
+        at_once = 1 << 13 if self.device.type == "cpu" else 1 << 22  # fits the cache, or takes 2 GB
+        for views in ragged_blocks(starts, at_once):
             part = starts[views.start : views.stop + 1]
             span = slice(int(part[0]), int(part[-1]))
             here = place[entries[span]]
@@ -289,13 +288,6 @@ class LandmarkScorer(Scorer):
         return [view_quantities(described, n_visible, self._of_camera)] if self._watch.watching else []
 
 
-MIN_IMAGES = 5  # of a map whose tracks show how often landmarks are detected
-BLOCKS = 8  # of images that are held out one after the other
-SHARE = 1 / 8  # of the images that a block takes
-TESTED = 2  # images of a block, at most
-MAX_POINTS = 20_000  # of the map that are examined, evenly spread
-MIN_OBSERVED = 50  # observations of remaining landmarks in the held-out images
-OFFSET_LANDMARKS = 512  # of an image that are described
 OFFSETS = np.linspace(-1, 2, 61).tolist()
 
 
@@ -334,44 +326,47 @@ def _known_offset(network: SetNetwork, localization_map: LocalizationMap) -> flo
 def detection_offset(network: SetNetwork, localization_map: LocalizationMap) -> float:
     """Estimate the offset of a network's log-odds of detection on a map from the tracks of its landmarks.
 
-    Blocks of images that share landmarks are held out. With the offset, the network predicts as many detections of the
-    remaining landmarks as there are observations of them in the held-out images. 0 if the images are unknown, fewer
-    than `MIN_IMAGES`, or observe hardly any of these landmarks. Measured in docs/research/cameras.md.
+    Eight blocks of images that share landmarks are held out, an eighth of the images each, and two images of each are
+    tested. With the offset, the network predicts as many detections of the remaining landmarks as there are
+    observations of them in these images. 0 if the images are unknown, fewer than five, or observe hardly any of these
+    landmarks. Measured in docs/research/cameras.md.
     """
     whole = localization_map.map.whole or localization_map.map
     images = whole.images
-    if images is None or len(images.image_ids) < MIN_IMAGES:
+    if images is None or len(images.image_ids) < 5:
         return 0.0
     kept = np.zeros(len(images.points), dtype=bool)
-    kept[:: max(1, -(-len(kept) // MAX_POINTS))] = True
+    kept[:: max(1, -(-len(kept) // 20_000))] = True  # evenly spread
     images = select_points(images, kept)
     observes = observation_matrix(images)
     n_observed = 0.0
-    parts: list[tuple[torch.Tensor, torch.Tensor]] = []
+    log_odds: list[Tensor] = []
+    weights: list[Tensor] = []
     seeing = np.flatnonzero(np.asarray(observes.sum(1)).reshape(-1))
-    for first in seeing[_spread(len(seeing), BLOCKS)]:
+    for first in seeing[_spread(len(seeing), 8)]:
         common = (observes @ observes[[first]].T).toarray().reshape(-1)
-        block = np.argsort(-common, kind="stable")[: max(1, round(len(images.image_ids) * SHARE))]
+        block = np.argsort(-common, kind="stable")[: max(1, round(len(images.image_ids) / 8))]
         block = block[common[block] > 0]
         remaining = whole.without(images, block)
         if len(remaining) == 0:
             continue
         describer = LandmarkDescriber(replace(localization_map, map=Map(remaining)), network.attributes)
-        tested = block[_spread(len(block), TESTED)]
+        tested = block[_spread(len(block), 2)]
         n_observed += observes[tested][:, np.isin(images.point_ids, remaining.ids)].sum()
         for row in tested:
             camera = whole.cameras[int(images.image_cameras[row])]
-            views = describer.of_camera(camera).in_blocks(images.image_poses[[row]], OFFSET_LANDMARKS)
+            views = describer.of_camera(camera).in_blocks(images.image_poses[[row]], 512)
             for _, described, n_visible in views:
                 with torch.inference_mode():
-                    log_odds = network.matchability(described.values).double()
-                parts.append((log_odds, (n_visible / max(1, len(log_odds))).expand(len(log_odds))))
-    if n_observed < MIN_OBSERVED:
+                    log_odds.append(network.matchability(described.values).double())
+                weights.append((n_visible / max(1, len(log_odds[-1]))).expand(len(log_odds[-1])))
+    if n_observed < 50:
         return 0.0
-    log_odds, weights = (torch.cat(part) for part in zip(*parts, strict=True))
+    each = torch.cat(weights)
+    odds = torch.cat(log_odds)
 
     def surplus(offset: float) -> float:
-        return float((weights * (log_odds + offset).sigmoid()).sum()) - n_observed
+        return float((each * (odds + offset).sigmoid()).sum()) - n_observed
 
     return OFFSETS[min(bisect_left(OFFSETS, 0.0, key=surplus), len(OFFSETS) - 1)]
 
@@ -388,11 +383,6 @@ by 0.05 where a view sees thousands."""
 
 NARROW = {"reprojection_error": 1.0, "triangulation_angle": -1.0, "distance_spread": -1.0}
 """Signs of the deviations of these attributes where landmarks were mapped from nearly one place."""
-MAX_DEVIATION = 1.5  # that counts, in standard deviations, so that one attribute alone decides nothing
-MAX_NARROW = 2.9
-"""Sum of the deviations of a view's mean attributes: 1.25 times what 0.1 % of the views of 18 rendered scenes exceed.
-Views of maps by a camera that turns in place exceed it. There, 4 to 17 times the expected inliers are found: in
-training, small triangulation angles occur at landmarks that are hard to match, with narrow baselines at all of them."""
 
 
 class SetScorer(LandmarkScorer):
@@ -464,8 +454,12 @@ class SetScorer(LandmarkScorer):
     def _in_range(self, described: ViewLandmarks, n_visible: Tensor) -> NDArray[np.bool_]:
         deviations = self.network.matchability.input(described.values) * self._signs
         means = torch.segment_reduce(deviations, "mean", lengths=described.counts)
-        narrow = means.clamp(max=MAX_DEVIATION).sum(1).cpu().numpy()
-        return super()._in_range(described, n_visible) & ~(narrow > MAX_NARROW)  # NaN without landmarks
+        # at most 1.5 standard deviations count, so that one attribute alone decides nothing
+        narrow = means.clamp(max=1.5).sum(1).cpu().numpy()
+        # 2.9 is 1.25 times what 0.1 % of the views of 18 rendered scenes exceed. Views of maps by a camera that turns in
+        # place exceed it. There, 4 to 17 times the expected inliers are found: in training, small triangulation angles
+        # occur at landmarks that are hard to match, with narrow baselines at all of them. NaN without landmarks.
+        return super()._in_range(described, n_visible) & ~(narrow > 2.9)
 
     def log_odds_of_detection(self, values: Tensor) -> Tensor:
         """Return the log-odds (E,) that landmarks (E, A) are detected, by the network's part for single landmarks."""

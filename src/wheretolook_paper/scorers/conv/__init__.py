@@ -43,6 +43,6 @@ METHODS = (
         weights="conv",
         probability=True,
         one_camera=True,
-        learner=Learner(imported("wheretolook_paper.scorers.conv.learn:learn_conv"), ConvConfig),
+        learner=Learner(imported("wheretolook_paper.scorers.conv.network:learn_conv"), ConvConfig),
     ),
 )

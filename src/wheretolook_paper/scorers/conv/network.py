@@ -1,4 +1,4 @@
-"""A small convolutional network over the grid of bins, the paper's input."""
+"""A small convolutional network over the grid of bins, the paper's input, and its training."""
 
 from __future__ import annotations
 
@@ -12,6 +12,9 @@ from torch.nn.functional import relu
 
 from wheretolook.inputs.statistics import FeatureStatistics
 from wheretolook.scorers.mlp.network import BinnedNetwork, StandardBins, statistics_of_record, statistics_record
+from wheretolook.training.data import ViewpointDataModule
+from wheretolook.training.fit import home_device
+from wheretolook.training.learner import TrainingJob, TrainingResult, train_network
 
 
 @dataclass(frozen=True)
@@ -64,3 +67,12 @@ class ConvNetwork(BinnedNetwork):
         """Return the untrained network of a description; ValueError if it names an unknown channel of the bins."""
         widths = tuple(stored["widths"])
         return cls(ConvSpec(statistics_of_record(stored), int(stored["bins"]), widths, float(stored["dropout"])))
+
+
+def learn_conv(task: TrainingJob) -> TrainingResult:
+    """Train a convolutional network on a dataset's train scenes, calibrated on validation views; raises as `load_views`."""
+    options = task.options
+    device = home_device(task.config)
+    data = ViewpointDataModule(task.dataset, task.config, options, options.bins, device, task.progress, True)
+    network = ConvNetwork(ConvSpec(data.statistics, options.bins, options.widths, options.dropout))
+    return train_network(network, data, task)

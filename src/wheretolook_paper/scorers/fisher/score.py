@@ -21,8 +21,6 @@ from wheretolook_paper.fisher.field import FisherField, stationary_axis_of_trace
 from wheretolook_paper.fisher.metrics import eigenvalues, metric_of, metric_of_eigenvalues
 from wheretolook_paper.scorers.fisher import Approximation
 
-PROBE_AXES = 2000  # axes among which the worst view is sought
-
 
 class PoseInformation:
     """Information of the views of a map, shared by all of its scorers."""
@@ -159,7 +157,7 @@ class WorstTraceScorer(ProbeScorer):
 
     def axis(self, field: FisherField, row: int) -> Float:
         """Return the axis (3,)."""
-        return worst_axis_of_trace(field, row, fibonacci_sphere(PROBE_AXES))
+        return worst_axis_of_trace(field, row, fibonacci_sphere(2000))  # axes among which the worst view is sought
 
 
 class StationaryTraceScorer(ProbeScorer):

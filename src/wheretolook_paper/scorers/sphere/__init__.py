@@ -52,6 +52,6 @@ METHODS = (
         weights="sphere",
         probability=True,
         one_camera=True,
-        learner=Learner(imported("wheretolook_paper.scorers.sphere.learn:learn_sphere"), SphereConfig),
+        learner=Learner(imported("wheretolook_paper.scorers.sphere.network:learn_sphere"), SphereConfig),
     ),
 )

@@ -40,8 +40,7 @@ class TreesConfig:
 
 
 def _build(localization_map: LocalizationMap, options: BuildOptions) -> Scorer:
-    from wheretolook_paper.scorers.trees.learn import BoostedTrees
-    from wheretolook_paper.scorers.trees.score import TreesScorer
+    from wheretolook_paper.scorers.trees.learn import BoostedTrees, TreesScorer
 
     assert options.weights is not None
     return TreesScorer(localization_map, BoostedTrees.load(options.weights))

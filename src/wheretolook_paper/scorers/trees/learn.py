@@ -1,4 +1,4 @@
-"""Boosted trees (LightGBM) on pooled statistics of the visible landmarks."""
+"""Boosted trees (LightGBM) on pooled statistics of the visible landmarks: training and score."""
 
 from __future__ import annotations
 
@@ -6,19 +6,25 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
+from lightgbm import Booster
 from numpy.typing import NDArray
 from scipy.special import expit
+from sklearn.metrics import average_precision_score, log_loss, roc_auc_score
 from tqdm.auto import tqdm
 
 from wheretolook.dataset.layout import Dataset, SceneFolder, views_by_camera
 from wheretolook.dataset.viewpoint_table import is_good, poses
 from wheretolook.geometry.camera import Camera, camera_of_record
-from wheretolook.geometry.poses import Float
+from wheretolook.geometry.poses import Float, check_poses
+from wheretolook.inputs.channels import ATTRIBUTES
 from wheretolook.inputs.landmark_features import LandmarkDescriber
+from wheretolook.inputs.localization_map import LocalizationMap
+from wheretolook.scorers.base import BLOCK
+from wheretolook.scorers.set.score import LandmarkScorer
 from wheretolook.training.data import check_classes, labelled_rows, validation_views
 from wheretolook.training.fit import home_device
 from wheretolook.training.learner import TrainingJob, TrainingResult, class_counts, fit_platt
@@ -28,11 +34,6 @@ from wheretolook.training.weights import check_method_of_weights, read_weights, 
 from wheretolook.utils.errors import ConfigError, WeightsError
 from wheretolook_paper.scorers.pooled_features import POOLED, pool
 from wheretolook_paper.scorers.trees import TreesConfig
-
-if TYPE_CHECKING:
-    from lightgbm import Booster
-
-BLOCK = 4096  # views described at a time: some million landmarks
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,7 +124,7 @@ def load_pooled(
             cam_from_world = poses(table)
             good = is_good(table, *limits)
             location = table["location_id"].to_numpy(np.int64)
-            for camera, rows in views_by_camera(scene, table, BLOCK):
+            for camera, rows in views_by_camera(scene, table, 4096):  # some million landmarks at a time
                 block = cam_from_world[rows]
                 described = describer.of_camera(camera).describe(block)
                 values = pool(described, block, camera).cpu().numpy()
@@ -159,7 +160,6 @@ def fit_trees(
     The seed decides which views LightGBM samples to choose bins.
     """
     import lightgbm
-    from sklearn.metrics import average_precision_score, log_loss, roc_auc_score
 
     leaves = {"num_leaves": config.max_leaves, "min_data_in_leaf": config.min_leaf, "lambda_l2": config.l2}
     options = {"objective": "binary", "learning_rate": config.learning_rate, **leaves, "seed": seed, "verbosity": -1}
@@ -182,3 +182,28 @@ def fit_trees(
     auc = float(roc_auc_score(val.labels, logits))
     metrics = {"n_trees": float(n_trees), "val_average_precision": precision[n_trees], "val_roc_auc": auc}
     return trees, {**metrics, "val_bce": bce}
+
+
+class TreesScorer(LandmarkScorer):
+    """Probability that a view localizes, by boosted trees on the positions and attributes of its visible landmarks."""
+
+    name = "trees"
+    local = True
+
+    def __init__(self, localization_map: LocalizationMap, trees: BoostedTrees) -> None:
+        super().__init__(localization_map, ATTRIBUTES, trees.training_range, trees.camera)
+        self.trees = trees
+
+    def score(self, cam_from_world: Float) -> Float:
+        """Return probabilities (B,) in [0, 1]."""
+        cam_from_world = check_poses(cam_from_world)
+        scores = np.empty(len(cam_from_world))
+        quantities: list[Float] = []
+        for begin in range(0, len(scores), BLOCK):
+            block = cam_from_world[begin : begin + BLOCK]
+            described = self.describer.describe(block)
+            quantities += self._quantities(described, described.counts)
+            pooled = pool(described, block, self.localization_map.camera)
+            scores[begin : begin + BLOCK] = expit(self.trees.logits(pooled.cpu().numpy()))
+        self._watch.check(self.name, self.training_range, quantities)
+        return scores

@@ -2,9 +2,9 @@
 
 import os
 
-import numpy as np
 import pandas as pd
 import pytest
+from numpy.testing import assert_allclose
 
 from wheretolook.geometry.pose_files import (
     MAX_ROWS,
@@ -35,7 +35,7 @@ def test_round_trips(tmp_path):
     first, second = pose_texts(POSES)
     (tmp_path / "images.txt").write_text(f"# comment\n1 {first} 1 a.jpg\n\n" + image.format(second))
     for name in ("path.tum", "path.csv", "views.csv", "poses.csv", "images.txt"):
-        np.testing.assert_allclose(Views.read(tmp_path / name).cam_from_world, POSES, atol=1e-8)
+        assert_allclose(Views.read(tmp_path / name).cam_from_world, POSES, atol=1e-8)
     assert Views.read(tmp_path / "images.txt").waypoint_id == ("a.jpg", "a b.jpg")
     assert Views.read(tmp_path / "path.tum").waypoint_id == ("0.5", "1")
 
@@ -49,7 +49,7 @@ def test_header_in_the_order_of_tum(time, tmp_path):
     views = Views.read(path)
     ids, poses = views.waypoint_id, views.cam_from_world
     assert ids == ("0" if time is None else "0.5",)
-    np.testing.assert_allclose(poses, poses_looking_along([(1, 2, 3)], [(1, 0, 0)]), atol=1e-12)
+    assert_allclose(poses, poses_looking_along([(1, 2, 3)], [(1, 0, 0)]), atol=1e-12)
     assert read_waypoints(path).points.tolist() == [[1, 2, 3]]
 
 
@@ -65,7 +65,7 @@ def test_texts_keep_the_centre_of_a_camera_far_away():
     for exact, offset, limit in ((True, 0, 1e-15), (False, 0, 1e-8), (False, 1e6, 1e-8)):
         poses = poses_looking_along(camera_centers(POSES) + offset, POSES[:, 2, :3])
         again = poses_of_values([[float(cell) for cell in text.split()] for text in pose_texts(poses, exact)])
-        np.testing.assert_allclose(camera_centers(again), camera_centers(poses), rtol=1e-15, atol=limit)
+        assert_allclose(camera_centers(again), camera_centers(poses), rtol=1e-15, atol=limit)
 
 
 def test_rows(tmp_path):

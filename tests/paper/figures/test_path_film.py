@@ -1,9 +1,6 @@
 """Film and figures of a path."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -39,7 +36,7 @@ def some_views(n: int, scale: float = 1.0) -> Views:
     )
 
 
-def test_films_have_a_frame_per_view(tmp_path: Path) -> None:
+def test_films_have_a_frame_per_view(tmp_path):
     frames = list(film_frames(some_views(4), LANDMARKS))
     save_moving(frames, FRAME_MS, tmp_path / "a.gif")
     with Image.open(tmp_path / "a.gif") as film:
@@ -52,13 +49,13 @@ def test_films_have_a_frame_per_view(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("scale", [1.0, -3e4])
-def test_still_figure_draws_scores_and_landmarks(scale: float) -> None:
+def test_still_figure_draws_scores_and_landmarks(scale):
     views = some_views(9, scale)
     figure = still_figure(views, LANDMARKS, "room")
     counts = [title.split()[1] for axes in figure.axes if "landmarks" in (title := axes.get_title())]
     assert counts == [str(len(views.pixels[number])) for number in (0, 2, 4, 6, 8)]
     axes = next(axes for axes in figure.axes if axes.get_ylabel() == "score")
-    drawn = np.column_stack([0.5 * np.arange(9), scale * np.arange(9) / 9])
+    drawn = np.arange(9)[:, None] * (0.5, scale / 9)
     np.testing.assert_allclose(axes.lines[0].get_xydata(), drawn)
     low, high = axes.get_ylim()
     assert (low <= views.score).all() and (views.score <= high).all()

@@ -259,12 +259,13 @@ class CachedOcclusion(OcclusionModel):
     """Caches the masks of another model, one bit for each line of sight.
 
     Hidden-point removal takes a tenth of a second for a location, and is evaluated several times: for the scores of all
-    directions, for those of the best views, and for their visible landmarks. Locations are rounded to 0.01 mm. Beyond a gigabyte the cache is
+    directions, for those of the best views, and for their visible landmarks. Locations are rounded to 0.01 mm. When `max_bytes` are exceeded the cache is
     cleared. Not safe for several threads with the same location.
     """
 
-    def __init__(self, model: OcclusionModel) -> None:
+    def __init__(self, model: OcclusionModel, max_bytes: int = 1 << 30) -> None:
         self.model = model
+        self.max_bytes = max_bytes
         self.name = model.name
         self.uses_all_cores = model.uses_all_cores
         self._known: dict[tuple[float, ...], NDArray[np.uint8]] = {}
@@ -282,7 +283,7 @@ class CachedOcclusion(OcclusionModel):
             if key in self._known:
                 mask[row] = np.unpackbits(self._known[key], count=len(points)).view(bool)
         for row, packed in zip(new, np.packbits(mask[new], axis=1), strict=True):
-            if (len(self._known) + 1) * packed.nbytes > 1 << 30:
+            if (len(self._known) + 1) * packed.nbytes > self.max_bytes:
                 self._known = {}
             self._known[keys[row]] = packed
         return mask

@@ -161,7 +161,7 @@ def test_keypoints_are_those_of_the_extractor(folder):
     rng = np.random.default_rng(0)
     grey = cv2.GaussianBlur(rng.integers(0, 256, (CAMERA.height, CAMERA.width), np.uint8), (0, 0), 3)
     grey = cv2.normalize(grey, None, 0, 255, cv2.NORM_MINMAX)
-    (expected,) = OpenCvSift(ExtractorConfig()).extract_batch([np.repeat(grey[:, :, None], 3, axis=2)])
+    (expected,) = OpenCvSift(ExtractorConfig(), "cpu").extract_batch([np.repeat(grey[:, :, None], 3, axis=2)])
     pixels, descriptors = RobotLocalizer(folder).extract(grey)
     assert len(pixels) > 50
     np.testing.assert_array_equal(pixels, expected.pixels)

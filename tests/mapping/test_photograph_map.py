@@ -14,7 +14,6 @@ from all_options import AllOptions, run
 from mapping.marker_rooms import CAMERA, MARKERS, hand_held_poses, marker_room, take_photographs
 from wheretolook.commands.label import Label
 from wheretolook.commands.map import BuildMap
-from wheretolook.commands.options import ScenesConfig
 from wheretolook.commands.sample import Sample
 from wheretolook.commands.viewpoint_map import BuildViewpointMap
 from wheretolook.dataset.sampling_config import SampleConfig
@@ -156,7 +155,7 @@ def experiment(mapped, photographs, tmp_path_factory):
         device="cpu",
         source={"photographs": config_of(photographs)},
         sample=SampleConfig(grid=(6, 4, 3), directions=60, keep=10),
-        scenes=ScenesConfig(mapped_space=MappedSpaceConfig(max_camera_distance_m=0.6)),
+        mapped_space=MappedSpaceConfig(max_camera_distance_m=0.6),
     )
     shutil.copytree(mapped[0] / "work", experiment.root / "room" / "photographs")
     said = []

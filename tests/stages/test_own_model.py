@@ -17,7 +17,7 @@ from mapping.marker_rooms import CAMERA, MARKERS, hand_held_poses, marker_room, 
 from wheretolook.cli import main
 from wheretolook.commands.label import Label
 from wheretolook.commands.map import BuildMap
-from wheretolook.commands.options import MapUseOptions, ScenesConfig, extractor_of, select_options
+from wheretolook.commands.options import extractor_of, select_options
 from wheretolook.commands.plan import Plan
 from wheretolook.commands.sample import Sample
 from wheretolook.commands.viewpoint_map import BuildViewpointMap
@@ -88,7 +88,7 @@ def experiment_of(model: Path, data: Path, **existing: object) -> AllOptions:
         name="mine",
         data=data,
         device="cpu",
-        scenes=ScenesConfig(mapped_space=MappedSpaceConfig(max_camera_distance_m=0.6)),
+        mapped_space=MappedSpaceConfig(max_camera_distance_m=0.6),
         source={"model": model, "scale": 1, **existing},
         sample=SampleConfig(grid=(6, 5, 3), directions=40, keep=10, max_locations=6),
         viewpoint_map=ViewpointMapConfig(grid=(6, 5, 3), directions=30, method="visible"),
@@ -195,7 +195,7 @@ def test_one_of_several_cameras_is_chosen(tmp_path):
     (scene,) = run(BuildMap, experiment_of(folder, tmp_path / "data", camera_id=2)).scenes
     assert scene.camera == OTHER
     sampled = select_options(Sample, experiment_of(folder, tmp_path / "sampled"))
-    sampled = replace(sampled, name="mine", map=folder, scale=1, camera_id=2, mapping=MapUseOptions())
+    sampled = replace(sampled, name="mine", map=folder, scale=1, camera_id=2)
     assert sampled.run().scenes[0].camera == OTHER
     named = replace(experiment_of(folder, tmp_path / "data"), camera=CameraConfig(400, 300, fov_deg=80.0))
     (scene,) = run(BuildMap, named).scenes

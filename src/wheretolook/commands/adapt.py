@@ -28,8 +28,13 @@ from wheretolook.commands.options import (
 from wheretolook.dataset.dataset_lock import reading
 from wheretolook.dataset.layout import Dataset, SceneFolder, views_by_camera
 from wheretolook.dataset.scene import ColmapFiles, Scene
+from wheretolook.geometry.poses import camera_centers
+from wheretolook.mapping.colmap_model import read_model
 from wheretolook.mapping.config import FrameOptions, place_name
+from wheretolook.mapping.map_frame import find_frame
 from wheretolook.scorers.weights import load_scorer, resolve_weights
+from wheretolook.tracking.runs import log as log_to_run
+from wheretolook.tracking.runs import start_run
 from wheretolook.tracking.store import TrackingConfig, check_store, kept_if_not_logged
 from wheretolook.utils.errors import (
     ConfigError,
@@ -53,11 +58,8 @@ if TYPE_CHECKING:
     from wheretolook.visibility.occlusion import OcclusionModel
 
 FOLDER = "adapted"  # of a dataset: adapted weights, and what they have gained
-MIN_VIEWS = 100
-MIN_LOCATIONS = 10
 MIN_OF_EACH_LABEL = 10
 _VIEWS_PER_TASK = 128  # the time is checked after each task
-_MAX_SIGNATURE = 256  # landmarks by which the scene is recognized
 
 
 @dataclass(frozen=True)
@@ -184,8 +186,6 @@ class Adapt(SceneOptions, LabelOptions, FrameOptions):
     def _adapt_map(self, model: Path, log: Log, progress: Progress) -> Path | None:
         """Adapt to a COLMAP map by its photographs only."""
         from wheretolook.holdout.photo_map import folder_of_check
-        from wheretolook.mapping.colmap_model import read_model
-        from wheretolook.mapping.map_frame import find_frame
 
         name = place_name(model)
         target = self._target(name, folder_of_check(self.data, name) / "adapted.safetensors")
@@ -223,8 +223,9 @@ class Adapt(SceneOptions, LabelOptions, FrameOptions):
         from wheretolook.holdout.scores import whole_map
 
         log(f"{name}: holding out blocks of photographs")
-        given = (self.adapt.images, self.adapt.database)
-        photographs, held_out = hold_out_photographs(self, "adapt", model, name, self.frame_options(), given)
+        photographs, held_out = hold_out_photographs(
+            self, "adapt", model, name, self.frame_options(), self.adapt.images, self.adapt.database
+        )
         views = photographed_views(photographs, held_out, weights, occlusion, self.warp_device)
         return views, whole_map(photographs, occlusion, self.warp_device)
 
@@ -246,8 +247,9 @@ class Adapt(SceneOptions, LabelOptions, FrameOptions):
 
         def gain_of(rows: NDArray[np.bool_]) -> Gain:
             some = views.rows(rows)
-            labels = some.good, some.place, some.centers, seed, some.blocks
-            return compare_log_odds(some.log_odds, adapted.held_out[rows], *labels)
+            return compare_log_odds(
+                some.log_odds, adapted.held_out[rows], some.good, some.place, some.centers, seed, some.blocks
+            )
 
         gain = gain_of(np.ones(len(views), dtype=bool))
         text = gain_markdown(gain)
@@ -270,14 +272,12 @@ class Adapt(SceneOptions, LabelOptions, FrameOptions):
         return path if is_better else None
 
     def _log_gain(self, target: _Target, adapted: Adapted, views: LocalizedViews, gain: Gain, is_better: bool) -> None:
-        from wheretolook.tracking.runs import log, start_run
-
         params = {"dataset": target.dataset, "scene": target.name, "weights": target.weights, **_counts(views)}
         params |= {"scale": adapted.scale, "offset": adapted.offset}
         metrics = {**gain.after, **{f"{name}_before": value for name, value in gain.before.items()}}
         metrics |= {"better": float(is_better), "log_loss_less": gain.log_loss_less[0]}
         with start_run(self.tracking, target.name, "adapt", params) as (client, run):
-            log(client, run, metrics=metrics)
+            log_to_run(client, run, metrics=metrics)
             for path in (target.path.with_suffix(".md"), *([target.path] if is_better else [])):
                 client.log_artifact(run, str(path))
 
@@ -315,7 +315,7 @@ class Adapt(SceneOptions, LabelOptions, FrameOptions):
         ids, row = np.unique(table["location_id"].to_numpy(), return_inverse=True)
         order = np.random.default_rng(self.adapt.seed).permutation(len(ids))[row.reshape(-1)]
         table = table.iloc[np.argsort(order, kind="stable")].reset_index(drop=True)
-        job = scene_job(files, self.label, extractor_of(files, self.mapping.extractor), scene.device)
+        job = scene_job(files, self.label, extractor_of(files, self.extractor), scene.device)
         tasks = []
         for begin in range(0, len(table), _VIEWS_PER_TASK):
             part = table.iloc[begin : begin + _VIEWS_PER_TASK]
@@ -348,7 +348,6 @@ def _scene(dataset: Dataset, name: str) -> SceneFolder:
 def labelled_views(files: SceneFolder, scene: Scene, table: pd.DataFrame, weights: Path) -> LocalizedViews:
     """Return the labelled views of a scene with the log-odds that the weights give them."""
     from wheretolook.dataset.viewpoint_table import is_good, poses
-    from wheretolook.geometry.poses import camera_centers
     from wheretolook.scorers.adapted.calibration import LocalizedViews
     from wheretolook.scorers.adapted.score import log_odds_of
 
@@ -370,10 +369,12 @@ def _check_enough(views: LocalizedViews, source: Path) -> None:
     n_good = int(views.good.sum())
     rendered = bool((views.photograph < 0).any())
     counts = (len(views), len(np.unique(views.group)), n_good, len(views) - n_good)
-    needed = (rendered * MIN_VIEWS, rendered * MIN_LOCATIONS, MIN_OF_EACH_LABEL, MIN_OF_EACH_LABEL)
+    needed = (rendered * 100, rendered * 10, MIN_OF_EACH_LABEL, MIN_OF_EACH_LABEL)
     if np.less(counts, needed).any():
-        problem = "adapting needs {} views at {} locations or blocks, of which {} localize and {} do not".format(
-            *needed
+        views_needed, places_needed, good_needed, bad_needed = needed
+        problem = (
+            f"adapting needs {views_needed} views at {places_needed} locations or blocks, of which {good_needed} "
+            f"localize and {bad_needed} do not"
         )
         fix = "Sample more viewpoints, or give more minutes." if rendered else "Use the bundled weights."
         raise TableError(problem, path=source, value=counts, fix=fix)
@@ -393,7 +394,8 @@ def _save(target: _Target, whole: LocalizationMap, adapted: Adapted, views: Loca
 
     base = for_map(TrainedNetwork.load(target.weights, SetNetwork, "set", device=whole.device), whole)
     points = whole.landmarks.points
-    n_signature = min(_MAX_SIGNATURE, len(points))
+    # the scene is recognized by as many landmarks
+    n_signature = min(256, len(points))
     network = AdaptedNetwork(base.network, base.scale, base.offset, n_signature)
     network.place[:] = torch.from_numpy(points[np.arange(n_signature) * len(points) // max(1, n_signature)])
     trained = TrainedNetwork("adapted", network, base.camera, adapted.scale, adapted.offset, base.training_range)

@@ -10,8 +10,15 @@ from typing import TYPE_CHECKING
 
 from wheretolook.commands.options import LabelOptions, OcclusionOptions, ScorerOptions
 from wheretolook.dataset.config import LOCK, checked_accuracy
+from wheretolook.dataset.layout import find_scene
+from wheretolook.dataset.scene import ColmapFiles, Scene
 from wheretolook.features.extractor import ExtractorConfig
+from wheretolook.mapping.colmap_model import holds_model, model_suffix
 from wheretolook.mapping.config import FrameOptions, place_name
+from wheretolook.mapping.map import find_features, find_photographs
+from wheretolook.scorers.registry import check_method
+from wheretolook.training.weights import read_training
+from wheretolook.utils.devices import usable_device
 from wheretolook.utils.errors import MapError, check_range, reject
 from wheretolook.utils.processes import cores, hold
 
@@ -24,9 +31,6 @@ if TYPE_CHECKING:
 
 def knows_photographs(files: SceneFolder, images: Path | None = None, database: Path | None = None) -> bool:
     """Return whether the photographs that a scene's map was made from, or their features, are known."""
-    from wheretolook.mapping.colmap_model import holds_model
-    from wheretolook.mapping.map import find_features, find_photographs
-
     return holds_model(files.map) and any((images, database, find_features(files.map), find_photographs(files.map)))
 
 
@@ -44,11 +48,12 @@ def hold_out_photographs(
     model: Path,
     name: str,
     frame: FrameOptions = FrameOptions(),
-    given: tuple[Path | None, Path | None] = (None, None),
+    images: Path | None = None,
+    database: Path | None = None,
 ) -> tuple[PhotographedMap, list[HoldoutResult]]:
     """Return a map and its photographs, held out in blocks; finished blocks are shared with `wheretolook check`.
 
-    `given` are the folder of the photographs and the database, if they are not next to the map. See
+    The folder of the photographs and the database are given if they are not next to the map. See
     `wheretolook.holdout.photo_map.open_map` for the other arguments and errors.
     """
     from wheretolook.holdout.holdout import hold_out_blocks
@@ -58,7 +63,7 @@ def hold_out_photographs(
     workers = options.n_workers
     device = options.warp_device
     with hold(out / ".lock", stage):
-        folder, features = features_of(model, *given, out / WORK, workers, device)
+        folder, features = features_of(model, images, database, out / WORK, workers, device)
         source = open_map(folder, features, name, frame, model)
         return source, hold_out_blocks(source, out / WORK, workers=workers, device=device)
 
@@ -144,10 +149,6 @@ class Check(OcclusionOptions, ScorerOptions, FrameOptions):
 
     def run(self) -> None:
         """Check the map, write the report to `out`, and print a summary."""
-        from wheretolook.dataset.layout import find_scene
-        from wheretolook.mapping.colmap_model import model_suffix
-        from wheretolook.scorers.registry import check_method
-
         start = time.monotonic()
         for method in filter(None, (self.method, *self.also)):
             check_method(method)
@@ -161,8 +162,6 @@ class Check(OcclusionOptions, ScorerOptions, FrameOptions):
         from wheretolook.holdout.photo_map import WORK, folder_of_check
         from wheretolook.holdout.report import check_map
         from wheretolook.holdout.scores import Scoring
-        from wheretolook.training.weights import read_training
-        from wheretolook.utils.devices import usable_device
 
         device = usable_device(self.device)
         workers = self.workers or cores()
@@ -189,9 +188,7 @@ class Check(OcclusionOptions, ScorerOptions, FrameOptions):
         self, scene: SceneFolder | None, work: Path, device: str, workers: int
     ) -> tuple[PhotographedMap, OcclusionModel]:
         """Open the map with its photographs' features, and the occlusion model; results go to `work`."""
-        from wheretolook.dataset.scene import ColmapFiles, Scene
         from wheretolook.holdout.photo_map import features_of, open_map
-        from wheretolook.mapping.map import find_features, find_photographs
 
         mesh = self.mesh
         model = self.map if scene is None else scene.map
@@ -204,8 +201,7 @@ class Check(OcclusionOptions, ScorerOptions, FrameOptions):
             problem = "neither the features nor the photographs of this map are known"
             fix = "Map the scene again with `wheretolook map --mapping.keep_database true`, which keeps the features."
             raise MapError(problem, path=model, fix=fix)
-        given = (self.images, self.database)
-        folder, features = features_of(model, *given, work, workers, device, self._extractor())
+        folder, features = features_of(model, self.images, self.database, work, workers, device, self._extractor())
         name = self.scene or place_name(model)
         photographs = replace(open_map(folder, features, name, frame, model), fov_deg=self.fov)
         files = ColmapFiles(model, mesh=mesh, frame=frame)

@@ -20,6 +20,7 @@ from wheretolook.commands.options import (
 from wheretolook.dataset.dataset_lock import reading, reads_dataset
 from wheretolook.dataset.layout import Dataset
 from wheretolook.evaluation.config import EvaluateConfig
+from wheretolook.scorers.registry import describe_methods
 from wheretolook.tracking.store import TrackingConfig, check_store, kept_if_not_logged
 from wheretolook.utils.errors import MapError
 from wheretolook.utils.files import write_text
@@ -81,8 +82,6 @@ class Evaluate(SceneOptions, LabelOptions):
 
 def list_methods() -> None:
     """Print the methods that can be compared."""
-    from wheretolook.scorers.registry import describe_methods
-
     texts = describe_methods()
     width = max(map(len, texts))
     print("\n".join(f"{name:<{width}}  {text}" for name, text in texts.items()))

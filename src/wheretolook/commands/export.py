@@ -8,7 +8,11 @@ from typing import ClassVar
 
 from wheretolook.commands.options import CameraOptions
 from wheretolook.dataset.config import checked_accuracy
+from wheretolook.dataset.scene import ColmapFiles, Scene
+from wheretolook.looks.next_look import mean_scores_by_pitch
 from wheretolook.mapping.config import FrameOptions
+from wheretolook.scorers.weights import load_scorer, resolve_weights
+from wheretolook.select.waypoints import grid_waypoints
 from wheretolook.utils.errors import ConfigError, check_positive
 from wheretolook.utils.package import or_shipped
 
@@ -63,10 +67,7 @@ class Export(CameraOptions, FrameOptions):
 
     def run(self) -> None:
         """Write the robot's folder."""
-        from wheretolook.dataset.scene import ColmapFiles, Scene
         from wheretolook.robot.export import export_robot, pinhole_of
-        from wheretolook.scorers.weights import load_scorer, resolve_weights
-        from wheretolook.select.waypoints import grid_waypoints
 
         files = ColmapFiles(self.map, mesh=self.mesh, database=self.database, frame=self.frame_options())
         occlusion = "none" if self.mesh is None else "mesh"
@@ -84,7 +85,6 @@ class Export(CameraOptions, FrameOptions):
         weights = or_shipped(self.weights) if self.weights else resolve_weights("set", None, source.landmarks.features)
         assert weights is not None
         if self.localize:
-            from wheretolook.looks.next_look import mean_scores_by_pitch
             from wheretolook.robot.export import export_localizer
             from wheretolook.select.image_localizer import ImageLocalizer
 

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, ClassVar
 from wheretolook.commands.options import (
     LabelOptions,
     Log,
-    MapUseOptions,
     Progress,
     ScenesConfig,
     existing,
@@ -29,6 +28,8 @@ from wheretolook.commands.scenes import Scenes
 from wheretolook.dataset.config import ALL
 from wheretolook.dataset.dataset_lock import changes_dataset
 from wheretolook.dataset.layout import Dataset, SceneFolder
+from wheretolook.features.extractor import ExtractorConfig
+from wheretolook.localization.confidence import RIGHT_PLACE_LIMITS
 from wheretolook.tracking.runs import log as log_to_run
 from wheretolook.tracking.runs import start_run
 from wheretolook.tracking.store import TrackingConfig, check_store, kept_if_not_logged
@@ -51,14 +52,15 @@ class Label(LabelOptions):
       wheretolook label --config configs/paper.yaml --engine ray
 
     Args:
-        mapping: where the weights of the map's extractor are, if they have moved.
+        extractor: where the weights of the map's extractor are, if they have moved since it was made.
         scenes: the generated scenes that `label.changes` changes, as for the scenes command.
         tracking: where MLflow keeps its runs.
     """
 
     SHORT: ClassVar = {"engine": "label.engine"}
+    GROUPS: ClassVar = {"extractor": "mapping.extractor."}
 
-    mapping: MapUseOptions = field(default_factory=MapUseOptions)
+    extractor: ExtractorConfig = field(default_factory=ExtractorConfig)
     scenes: ScenesConfig = field(default_factory=ScenesConfig)
     tracking: TrackingConfig = field(default_factory=TrackingConfig)
 
@@ -97,7 +99,7 @@ class Label(LabelOptions):
         return dataset
 
     def _key(self, files: SceneFolder) -> str:
-        extractor = extractor_of(files, self.mapping.extractor)
+        extractor = extractor_of(files, self.extractor)
         settings = [self.label.localizer.record(), extractor.record(), files.camera.record()]
         made_from = [existing(files.mesh, SceneError, "scenes"), existing(files.landmarks, MapError, "map")]
         changes = [name for name in ("store_matches", "store_pixels") if getattr(self.label, name)]
@@ -115,7 +117,7 @@ class Label(LabelOptions):
         scenes = {files.name: files for files in to_label}
         tasks = []
         for files in to_label:
-            job = scene_job(files, config, extractor_of(files, self.mapping.extractor), self.warp_device)
+            job = scene_job(files, config, extractor_of(files, self.extractor), self.warp_device)
             job = replace(job, store_matches=config.store_matches, store_pixels=config.store_pixels)
             if config.changes:
                 changed_mesh = select_options(Scenes, self).change(files, config.changes)
@@ -147,14 +149,14 @@ def _shards(files: SceneFolder) -> Path:
 
 def _report(files: SceneFolder, table: pd.DataFrame, log: Log) -> None:
     from wheretolook.dataset.viewpoint_table import by_first, has_first, is_good
-    from wheretolook.localization.confidence import RIGHT_PLACE_LIMITS
 
     text = f"{is_good(table).mean():.0%} of {len(table):,} viewpoints localize within 5 cm and 0.4 degrees"
     if has_first(table):
         first = by_first(table)
-        places = [is_good(labels, *RIGHT_PLACE_LIMITS).mean() for labels in (table, first)]
+        limit_m, limit_deg = RIGHT_PLACE_LIMITS
+        near, near_first = (is_good(labels, limit_m, limit_deg).mean() for labels in (table, first))
         text += f" ({is_good(first).mean():.0%} by the first RANSAC result), "
-        text += "{:.0%} ({:.0%}) at the right place".format(*places)
+        text += f"{near:.0%} ({near_first:.0%}) at the right place"
     log(f"{files.name}: {text} -> {files.table}")
 
 

@@ -8,11 +8,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
+from tqdm.auto import tqdm
+
 from wheretolook.commands.options import CameraOptions
 from wheretolook.dataset.config import checked_accuracy
 from wheretolook.features.extractor import ExtractorConfig
 from wheretolook.figures import KINDS
 from wheretolook.mapping.config import FrameOptions
+from wheretolook.mapping.photographs import SUFFIXES
+from wheretolook.utils.devices import usable_device
 from wheretolook.utils.errors import ConfigError, MapError, WhereToLookError, check_choice
 
 if TYPE_CHECKING:
@@ -106,7 +110,6 @@ class Localize(CameraOptions, FrameOptions):
     def run(self) -> list[Localized]:
         """Localize the images, write `out` and `figure`, and print a summary."""
         from wheretolook.select.localized import check_localized_format, distinct_names, save_localized
-        from wheretolook.utils.devices import usable_device
 
         start = time.monotonic()
         if self.out is not None:
@@ -148,8 +151,6 @@ class Localize(CameraOptions, FrameOptions):
 
     def _paths(self) -> list[Path]:
         """Return the files of all images. Raises MapError if one is missing, or a folder has none."""
-        from wheretolook.mapping.photographs import SUFFIXES
-
         paths: list[Path] = []
         for path in self.images:
             in_folder = (file for file in path.rglob("*") if file.suffix.lower() in SUFFIXES)
@@ -162,8 +163,6 @@ class Localize(CameraOptions, FrameOptions):
 
     def _results(self, localizer: ImageLocalizer, paths: list[Path], names: list[str]) -> Iterable[Localized]:
         """Yield the result of the rig, or of each image, with a progress bar."""
-        from tqdm.auto import tqdm
-
         from wheretolook.localization.rig import PosePrior
         from wheretolook.select.localized import FAILED, Localized
 

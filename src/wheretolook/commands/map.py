@@ -30,11 +30,16 @@ from wheretolook.commands.options import (
 )
 from wheretolook.dataset.dataset_lock import changes_dataset
 from wheretolook.dataset.layout import Dataset, SceneFolder
-from wheretolook.geometry.camera import Camera, CameraConfig, PinholeCamera, describe_camera, draw_camera
+from wheretolook.features.extractor import ExtractorConfig
+from wheretolook.geometry.camera import Camera, CameraConfig, PinholeCamera, cameras_by_id, describe_camera, draw_camera
+from wheretolook.mapping.colmap_model import find_camera, read_model
 from wheretolook.mapping.config import FrameOptions, ImportConfig, MapConfig, PhotographsConfig, place_name
 from wheretolook.mapping.georeference import read_scale
-from wheretolook.mapping.map import source_of_map
-from wheretolook.mapping.map_frame import read_frame
+from wheretolook.mapping.imported_map import map_existing
+from wheretolook.mapping.map import choose_features, source_of_map
+from wheretolook.mapping.map_frame import read_frame, warn_of_mesh
+from wheretolook.mapping.photograph_map import map_photographs
+from wheretolook.mapping.photographs import list_photographs
 from wheretolook.utils.errors import ConfigError, MapError, SceneError, reject
 from wheretolook.utils.files import cache_key, check_folder_name, fingerprint, path_within, size_and_time
 
@@ -74,7 +79,7 @@ class BuildMap(SceneOptions, LabelOptions, FrameOptions):
     }
     GROUPS: ClassVar = {"photographs": "mapping.photographs."}
 
-    mapping: MapConfig = field(default_factory=MapConfig)  # type: ignore[assignment]
+    mapping: MapConfig = field(default_factory=MapConfig)
     photographs: PhotographsConfig = field(default_factory=PhotographsConfig)
     model: Path | None = None
     mesh: Path | None = None
@@ -97,6 +102,11 @@ class BuildMap(SceneOptions, LabelOptions, FrameOptions):
             ),
             (is_rendered and frame != FrameOptions(), "scale and up belong to --model or --images", vars(frame)),
             (self.model is None and bool(of_model), "these belong to --model", of_model),
+            (
+                self.mapping.extractor != ExtractorConfig(),
+                "the extractor is given beside mapping: BuildMap(extractor=...)",
+                self.mapping.extractor.method,
+            ),
         )
         if self.model is not None:
             _ = self.import_config
@@ -125,7 +135,7 @@ class BuildMap(SceneOptions, LabelOptions, FrameOptions):
 
     @property
     def _kept(self) -> dict[str, Any]:
-        return {"extractor": self.mapping.extractor, "keep_database": self.mapping.keep_database}
+        return {"extractor": self.extractor, "keep_database": self.mapping.keep_database}
 
     @changes_dataset("map")
     def run(self, log: Log = print, progress: Progress = ignore_progress) -> Dataset:
@@ -157,7 +167,7 @@ class BuildMap(SceneOptions, LabelOptions, FrameOptions):
 
 def _map_mesh(options: BuildMap, files: SceneFolder, log: Log) -> None:
     """Map a scene by renders of its mesh, unless its map is current."""
-    config = options.mapping
+    config = replace(options.mapping, extractor=options.extractor)
     scene = open_scene(options, files)
     seed = _seed(files)
     made_from = existing(files.mesh, SceneError, "scenes")
@@ -213,8 +223,6 @@ def _map_photographs(options: BuildMap, log: Log) -> SceneFolder:
 
     Returns the scene, with the camera of most photographs unless one is configured. Raises what `map_photographs` does.
     """
-    from wheretolook.mapping.photographs import list_photographs
-
     settings = options.photographs_config
     folder = settings.images
     assert folder is not None
@@ -231,7 +239,6 @@ def _map_photographs(options: BuildMap, log: Log) -> SceneFolder:
     if cache.is_current(scene.landmarks, scene.mapping_cameras):
         log(f"{scene.name}: reusing {scene.map}")
         return _with_mapping_camera(options, scene)
-    from wheretolook.mapping.photograph_map import map_photographs
 
     report = map_photographs(
         settings,
@@ -255,9 +262,6 @@ def _import_model(options: BuildMap, log: Log) -> tuple[SceneFolder, Dataset]:
 
     Returns the scene, and the dataset with it. Raises what `map_existing` does, and SceneError if the mesh cannot be used.
     """
-    from wheretolook.mapping.colmap_model import read_model
-    from wheretolook.mapping.map import choose_features
-
     settings = options.import_config
     folder = settings.model
     scene = _new_scene(options, folder)
@@ -279,8 +283,6 @@ def _import_model(options: BuildMap, log: Log) -> tuple[SceneFolder, Dataset]:
     if cache.is_current(scene.landmarks, scene.mapping_cameras, *([scene.mesh] if mesh else [])):
         log(f"{scene.name}: reusing {scene.map}")
         return scene, dataset
-    from wheretolook.mapping.imported_map import map_existing
-    from wheretolook.mapping.map_frame import warn_of_mesh
     from wheretolook.rendering.raycasting import MeshRaycaster
     from wheretolook.scenes.loading import load_mesh, save_glb
 
@@ -327,9 +329,6 @@ def _new_scene(options: BuildMap, source: Path) -> SceneFolder:
 
 def _with_mapping_camera(options: BuildMap, scene: SceneFolder) -> SceneFolder:
     """Return the scene with the camera that took most of its photographs, unless the options configure one."""
-    from wheretolook.geometry.camera import cameras_by_id
-    from wheretolook.mapping.colmap_model import read_model
-
     if options.camera != CameraConfig():
         return scene
     model = read_model(scene.map)
@@ -340,9 +339,6 @@ def _with_mapping_camera(options: BuildMap, scene: SceneFolder) -> SceneFolder:
 
 def _with_own_camera(scene: SceneFolder, model: Any, folder: Path, camera_id: int | None) -> SceneFolder:
     """Return the scene with a camera of the model in a folder."""
-    from wheretolook.geometry.camera import cameras_by_id
-    from wheretolook.mapping.colmap_model import find_camera
-
     try:
         camera = find_camera(cameras_by_id(model.cameras, folder), folder, camera_id)
         return replace(scene, camera=camera, own_camera=True)
@@ -411,8 +407,7 @@ def imports_map(run: Callable[..., Any]) -> Callable[..., Any]:
     @wraps(run)
     def run_on_scene(command: Any, log: Log = print, progress: Progress = ignore_progress) -> Any:
         if command.map is not None:
-            mapping = MapConfig(extractor=command.mapping.extractor)
-            select_options(BuildMap, command, mapping=mapping, model=command.map).run(log)
+            select_options(BuildMap, command, model=command.map).run(log)
         return run(command, log, progress)
 
     return run_on_scene

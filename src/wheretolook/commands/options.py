@@ -11,9 +11,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeVar, get_args
 
 from wheretolook.dataset.config import RELEASE_FILE
+from wheretolook.dataset.layout import Dataset
 from wheretolook.dataset.sampling_config import SampleConfig
+from wheretolook.dataset.scene import Scene, SceneConfig
 from wheretolook.features.extractor import ExtractorConfig
-from wheretolook.geometry.camera import Camera, CameraConfig, describe_camera
+from wheretolook.geometry.camera import Camera, CameraConfig, describe_camera, parse_camera
 from wheretolook.localization.config import LabelConfig
 from wheretolook.mapping.config import MapConfig
 from wheretolook.scenes.config import ApartmentConfig, SceneKind
@@ -81,8 +83,6 @@ class ScenesConfig:
             `vary` draw their sizes and difficulty from the seed.
         apartment: options of apartments, and the texture and light of all generated scenes.
         meshes: scenes from existing meshes, in addition to generated ones, such as [{path: scans/office.glb}].
-        free_space: positions that a camera may take.
-        mapped_space: the same in a scene of photographs, which has no mesh.
     """
 
     train: int = 3
@@ -92,8 +92,6 @@ class ScenesConfig:
     kinds: tuple[SceneKind, ...] = ("apartment",)
     apartment: ApartmentConfig = field(default_factory=ApartmentConfig)
     meshes: tuple[MeshSource, ...] = ()
-    free_space: FreeSpaceConfig = field(default_factory=FreeSpaceConfig)
-    mapped_space: MappedSpaceConfig = field(default_factory=MappedSpaceConfig)
 
     def __post_init__(self) -> None:
         counts = (self.train, self.val, self.test)
@@ -171,7 +169,8 @@ class Command:
     """Option with which the command prints a list and does nothing else."""
 
     def __init_subclass__(cls) -> None:
-        """Let the command's `run` check its outputs first."""
+        """Let the command's `run` check its outputs first, and collect the `GROUPS` of its bases."""
+        cls.GROUPS = {name: text for base in cls.__mro__[::-1] for name, text in vars(base).get("GROUPS", {}).items()}
         if "run" in vars(cls):
             cls.run = _checking_outputs(cls.run)  # type: ignore[method-assign]
 
@@ -213,43 +212,27 @@ class DatasetOptions(Command):
         return usable_device(self.device)
 
 
-@dataclass(frozen=True)
-class SpaceOptions:
-    """Where a camera can be.
-
-    Args:
-        free_space: in a scene with a mesh.
-        mapped_space: in a scene of photographs, which has no mesh.
-    """
-
-    free_space: FreeSpaceConfig = field(default_factory=FreeSpaceConfig)
-    mapped_space: MappedSpaceConfig = field(default_factory=MappedSpaceConfig)
-
-
-@dataclass(frozen=True)
-class MapUseOptions:
-    """How an existing map is used.
-
-    Args:
-        extractor: where the weights of the map's extractor are, if they have moved since the map was made.
-    """
-
-    extractor: ExtractorConfig = field(default_factory=ExtractorConfig)
-
-
 @dataclass(frozen=True, kw_only=True)
 class SceneOptions(DatasetOptions):
     """How the scenes of a dataset are read.
 
     Args:
         occlusion: how occluded landmarks are recognized.
-        scenes: where a camera can be.
-        mapping: how maps are used.
+        free_space: positions that a camera may take.
+        mapped_space: the same in a scene of photographs, which has no mesh.
+        extractor: keypoints of maps. Of an existing map, only its weights count, if they have moved since it was made.
     """
 
+    GROUPS: ClassVar = {
+        "free_space": "scenes.free_space.",
+        "mapped_space": "scenes.mapped_space.",
+        "extractor": "mapping.extractor.",
+    }
+
     occlusion: OcclusionConfig = field(default_factory=OcclusionConfig)
-    scenes: SpaceOptions = field(default_factory=SpaceOptions)
-    mapping: MapUseOptions = field(default_factory=MapUseOptions)
+    free_space: FreeSpaceConfig = field(default_factory=FreeSpaceConfig)
+    mapped_space: MappedSpaceConfig = field(default_factory=MappedSpaceConfig)
+    extractor: ExtractorConfig = field(default_factory=ExtractorConfig)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -286,8 +269,8 @@ class Experiment(SceneOptions, LabelOptions):
         tracking: where MLflow keeps its runs.
     """
 
-    scenes: ScenesConfig = field(default_factory=ScenesConfig)  # type: ignore[assignment]
-    mapping: MapConfig = field(default_factory=MapConfig)  # type: ignore[assignment]
+    scenes: ScenesConfig = field(default_factory=ScenesConfig)
+    mapping: MapConfig = field(default_factory=MapConfig)
     sample: SampleConfig = field(default_factory=SampleConfig)
     tracking: TrackingConfig = field(default_factory=TrackingConfig)
 
@@ -312,8 +295,6 @@ class CameraOptions(Command):
 
     def named_camera(self) -> Camera | int | None:
         """Return the camera asked for: one, a camera_id of the map, or None for the map's own."""
-        from wheretolook.geometry.camera import parse_camera
-
         if self.camera is not None and self.camera_id is not None:
             raise ConfigError("the camera is described in several ways", value=self.camera, fix="Give one of them.")
         return self.camera_id if self.camera is None else parse_camera(self.camera)
@@ -359,8 +340,6 @@ def load_dataset(
     Raises ConfigError if it was made with another camera, or is a release where meshes and maps are needed; TableError
     if it does not exist, or the stage has not been run.
     """
-    from wheretolook.dataset.layout import Dataset
-
     _ = options.warp_device  # a missing GPU is an error now, not after hours of other work
     dataset = Dataset.load(options.root)
     if required_stage != "label":
@@ -381,10 +360,7 @@ def load_dataset(
 
 def open_scene(options: SceneOptions, files: SceneFolder) -> Scene:
     """Return a scene of the dataset with a command's occlusion, free space and device; nothing is read yet."""
-    from wheretolook.dataset.scene import Scene, SceneConfig
-
-    scenes = options.scenes
-    config = SceneConfig(options.occlusion, scenes.free_space, scenes.mapped_space)
+    config = SceneConfig(options.occlusion, options.free_space, options.mapped_space)
     scene = Scene(files, config=config, device=options.device)
     if files.own_camera:
         camera = f"the camera of its map, {describe_camera(files.camera)}"
@@ -439,8 +415,16 @@ def scene_job(files: SceneFolder, label: LabelConfig, extractor: ExtractorConfig
     from wheretolook.localization.shard import SceneJob
 
     cameras = tuple(files.cameras().items()) if files.cameras_file.is_file() else ()
-    made_from = files.mesh, files.landmarks, files.camera, label.localizer, extractor, device
-    return SceneJob(*made_from, cameras=cameras, appearance=label.appearance)
+    return SceneJob(
+        files.mesh,
+        files.landmarks,
+        files.camera,
+        label.localizer,
+        extractor,
+        device,
+        cameras=cameras,
+        appearance=label.appearance,
+    )
 
 
 def existing(path: Path, error: type[SceneError] | type[MapError], stage: str) -> str:

@@ -15,12 +15,13 @@ from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.geometry.similarity import Similarity
 from wheretolook.planning.config import PlanConfig
+from wheretolook.planning.view_sequence import lengths_along
 from wheretolook.tracking.runs import joined, start_run
 from wheretolook.tracking.runs import log as log_to_run
 from wheretolook.tracking.store import TrackingConfig, check_store, kept_if_not_logged
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.files import write_text
-from wheretolook.utils.package import reports
+from wheretolook.utils.package import reports, require
 from wheretolook.utils.processes import hold
 from wheretolook.utils.texts import score_text
 
@@ -68,7 +69,6 @@ class Plan(SceneOrMapOptions):
             TrackingError: the tracking store cannot be used.
         """
         from wheretolook.planning.method_paths import path_views, plan_by_methods
-        from wheretolook.utils.package import require
 
         dataset = load_dataset(self, "map")
         config = self.plan
@@ -88,7 +88,8 @@ class Plan(SceneOrMapOptions):
         renderer = None if scene.is_photographed else scene.renderer
         views[method] = path_views(path, scene.localization_map, renderer)
         folder = (config.out or files.folder / "path").resolve()  # "." gets a name, too
-        with hold(folder.with_name(f".{folder.name}.lock"), "plan", wait_s=WAIT_S):
+        # another plan may be writing its path into the same folder
+        with hold(folder.with_name(f".{folder.name}.lock"), "plan", wait_s=120.0):
             written = []
             for report in reports("plan"):
                 written += report(views, scene.landmarks.points, f"{scene.name}, {method}", folder, config.film)
@@ -105,13 +106,11 @@ class Plan(SceneOrMapOptions):
         return path
 
 
-WAIT_S = 120.0  # for another plan to write its path into the same folder
+WAIT_S = 120.0  # another plan may be writing its path into the same folder
 
 
 def _summary(path: PlannedPath) -> str:
     """Describe a path and its stops in a line."""
-    from wheretolook.planning.view_sequence import lengths_along
-
     text = f"{path.length_m:.2f} m, {path.turn_deg:.0f} degrees of turning, views: {len(path.positions)}"
     if not np.isnan(path.scores).any():
         text += f", mean score {score_text(float(np.mean(path.scores)))}"

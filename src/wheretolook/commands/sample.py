@@ -14,6 +14,7 @@ from wheretolook.dataset.layout import Dataset
 from wheretolook.dataset.sampling_config import SampleConfig
 from wheretolook.dataset.scene import Scene
 from wheretolook.geometry.camera import Camera, draw_camera, write_cameras
+from wheretolook.mapping.colmap_model import colmap_poses
 from wheretolook.utils.errors import MapError, SceneError
 from wheretolook.utils.files import cache_key
 
@@ -83,17 +84,17 @@ def _cameras(scene: Scene, config: SampleConfig) -> Camera | dict[int, Camera]:
 def _sample(scene: Scene, config: SampleConfig, log: Log) -> None:
     from wheretolook.dataset.sampling import sample_viewpoints
     from wheretolook.dataset.viewpoint_files import write_table
-    from wheretolook.mapping.colmap_model import colmap_poses
 
     files = scene.folder
     with naming_file(files.source):
         grid, free = scene.free_voxels(config, scene.sampled_space)
         cameras = _cameras(scene, config)
-        visible = (scene.landmarks, cameras, scene.occlusion)
         title = f"sample {scene.name}"
         config = replace(config, max_directions=config.directions_of(files.split))
         mapped = colmap_poses(files.map) if config.near_map else None
-        table, occlusion = sample_viewpoints(grid, free, *visible, config, scene.device, title, mapped)
+        table, occlusion = sample_viewpoints(
+            grid, free, scene.landmarks, cameras, scene.occlusion, config, scene.device, title, mapped
+        )
     files.stage_cache("sample").clear()
     files.cameras_file.unlink(missing_ok=True)
     if isinstance(cameras, dict):

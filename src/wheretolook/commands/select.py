@@ -12,8 +12,12 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 from wheretolook.commands.options import CameraOptions, OcclusionOptions, ScorerOptions
 from wheretolook.dataset.config import checked_accuracy
 from wheretolook.figures import KINDS
+from wheretolook.geometry.camera import PinholeCamera, describe_camera, parse_size
+from wheretolook.geometry.views import Views, check_format
+from wheretolook.mapping.colmap_model import model_suffix
 from wheretolook.mapping.config import FrameOptions
-from wheretolook.select.waypoints import SelectionRequest
+from wheretolook.select.waypoints import SelectionRequest, parse_points, read_waypoints
+from wheretolook.utils.devices import usable_device
 from wheretolook.utils.errors import ConfigError, MapWarning, check_choice
 
 if TYPE_CHECKING:
@@ -64,8 +68,6 @@ class SelectorOptions(CameraOptions, OcclusionOptions, ScorerOptions, FrameOptio
 
     def named_camera(self) -> Camera | int | None:
         """Return the camera asked for: one, a camera_id of the map, or None for the map's own."""
-        from wheretolook.geometry.camera import PinholeCamera, parse_size
-
         described = super().named_camera()
         if self.fov is None:
             if self.size is not None:
@@ -77,8 +79,6 @@ class SelectorOptions(CameraOptions, OcclusionOptions, ScorerOptions, FrameOptio
 
     def open_map(self, **directions: Any) -> WhereToLook:
         """Open the map; `directions` are options of `WhereToLook.from_colmap`."""
-        from wheretolook.mapping.colmap_model import model_suffix
-        from wheretolook.utils.devices import usable_device
         from wheretolook.utils.warp import start_warp
         from wheretolook.visibility.counting import compile_kernels
 
@@ -116,7 +116,6 @@ def finish(command: SelectorOptions, selector: WhereToLook, views: Views, given:
 
         save_figure(selector.floor_plan(views), command.floor_plan)
         print(f"floor plan: {command.floor_plan}")
-    from wheretolook.geometry.camera import describe_camera
 
     localization_map = selector.localization_map
     print(f"{selector.frame.describe()}; camera: {describe_camera(localization_map.camera)}")
@@ -196,8 +195,6 @@ class Select(SelectionRequest, SelectorOptions):
     lattice: Literal["fibonacci", "yaw-pitch"] = "fibonacci"
 
     def __post_init__(self) -> None:
-        from wheretolook.geometry.views import check_format
-
         SelectionRequest.__post_init__(self)
         SelectorOptions.__post_init__(self)
         check_format(self.out, self.format, max(self.n, self.looks or 1))
@@ -222,14 +219,9 @@ class Select(SelectionRequest, SelectorOptions):
 
     def _waypoints(self) -> Waypoints | None:
         """Return the waypoints, None for a grid."""
-        from wheretolook.select.waypoints import parse_points, read_waypoints
-
         if len(self.at) == 1 and (Path(self.at[0].strip()).exists() or self.at[0].count(",") != 2):
             return read_waypoints(self.at[0].strip())
         return parse_points(self.at) if self.at else None
-
-
-BODY_PITCH_DEG = 60.0  # of all poses, from which on they seem to be of a robot whose z is up
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -257,19 +249,16 @@ class Score(SelectorOptions):
     skip: bool = False
 
     def __post_init__(self) -> None:
-        from wheretolook.geometry.views import check_format
-
         super().__post_init__()
         check_format(self.out, self.format, 1)
 
     def run(self) -> Views:
         """Score the poses, write them to `out` and print a summary."""
-        from wheretolook.geometry.views import Views
-
         poses = Views.read(self.poses)
         selector = self.open_map()
         views = selector.report(poses.cam_from_world, poses.waypoint_id, self.skip)
-        if (views.pitch_deg > BODY_PITCH_DEG).all():
+        # cameras do not all look up this steeply: the poses seem to be of a robot whose z is up
+        if (views.pitch_deg > 60.0).all():
             text = (
                 "every camera looks up; are these a robot's orientations, x ahead and z up? Give its camera's, z ahead"
             )

@@ -16,6 +16,19 @@ from wheretolook.scorers.train_config import TrainConfig
 from wheretolook.tracking.runs import log as log_to_run
 from wheretolook.tracking.runs import log_history, start_run
 from wheretolook.tracking.store import TrackingConfig, check_store, kept_if_not_logged, warn_not_logged
+from wheretolook.training.provenance import (
+    HISTORY_CSV,
+    NOT_LOGGED,
+    TrainedModel,
+    about_training,
+    history_not_logged,
+    kept_metrics,
+    params_of,
+    trained_before,
+    weights_path,
+)
+from wheretolook.training.scenes import with_also
+from wheretolook.training.weights import read_record
 from wheretolook.utils.errors import TrackingError
 from wheretolook.utils.files import safe_child, sha256, temporary_folder, write_json, write_text
 
@@ -76,9 +89,6 @@ def train_methods(
         TrackingError: the tracking store cannot be used. If it fails later, weights and records are kept, a
             TrackingWarning says that the training is not logged, and the next call logs it.
     """
-    from wheretolook.training.provenance import about_training, trained_before, weights_path
-    from wheretolook.training.scenes import with_also
-
     shared: Values = {"progress": progress, "kept": {}}
     models = []
     with ExitStack() as stack:
@@ -109,7 +119,6 @@ def _train(
 
     from wheretolook.training.fit import RunLog
     from wheretolook.training.learner import TrainingJob
-    from wheretolook.training.provenance import NOT_LOGGED, TrainedModel, kept_metrics, params_of, weights_path
 
     assert method.learner is not None
     path = weights_path(dataset, method.name)  # the title is that of its progress bar
@@ -144,9 +153,6 @@ def _train(
 
 def _log_later(model: TrainedModel, tracking: TrackingConfig) -> TrainedModel:
     """Log a training from the record of its weights, as training itself does."""
-    from wheretolook.training.provenance import NOT_LOGGED, history_not_logged, kept_metrics, params_of
-    from wheretolook.training.weights import read_record
-
     record = read_record(model.path)
     history = history_not_logged(record)
     params = params_of(record["about"]) | record.pop(NOT_LOGGED, {}).get("params", {})
@@ -162,8 +168,6 @@ def _log_later(model: TrainedModel, tracking: TrackingConfig) -> TrainedModel:
 
 
 def _log_artifacts(client: MlflowClient, run_id: str, weights: Path, history: pd.DataFrame | None) -> None:
-    from wheretolook.training.provenance import HISTORY_CSV
-
     client.log_artifact(run_id, str(weights))
     if history is None:
         return

@@ -5,16 +5,13 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from wheretolook.commands.options import CameraOptions
+from wheretolook.dataset.layout import find_scene
 from wheretolook.mapping.config import FrameOptions
+from wheretolook.utils.devices import usable_device
 from wheretolook.utils.errors import ConfigError, reject
-from wheretolook.utils.package import reports
-
-if TYPE_CHECKING:
-    from wheretolook.view.state import ViewState
-    from wheretolook.view.viewed_map import ViewedMap
+from wheretolook.utils.package import reports, require
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -102,13 +99,27 @@ class View(CameraOptions, FrameOptions):
     def run(self) -> None:
         """Serve the page until interrupted; or write a recording or a film."""
         start = time.monotonic()
-        self._check_environment()
+        if self.scene is not None and self.data.is_dir():
+            find_scene(self.data, self.scene, self.name)
+        if self.record is not None:
+            require("rerun")
+        from wheretolook.view.recording import record
+        from wheretolook.view.server import Viewer, check_port
         from wheretolook.view.state import ViewState, read_paths
+        from wheretolook.view.viewed_map import open_map, open_scene
 
+        if self.record is None and self.film is None:
+            check_port(self.host, self.port)
         state = ViewState.parse(self.state)
         if self.method:
             state = replace(state, method=self.method)
-        viewed = self._open()
+        device = usable_device(self.device)
+        camera = self.named_camera()
+        if self.map is not None:
+            viewed = open_map(self.map, self.mesh, camera, self.weights, device, self.data, self.frame_options())
+        else:
+            assert self.scene is not None and not isinstance(camera, int)
+            viewed = open_scene(self.data, self.scene, self.name, camera, self.weights, device)
         if self.path is not None:
             viewed.paths = read_paths(self.path, self.pair, viewed.frame.world_from_map)
         if state.method and state.method not in viewed.weights.methods:
@@ -116,8 +127,6 @@ class View(CameraOptions, FrameOptions):
             raise ConfigError("there is no such method here, or no weights of it", value=state.method, fix=fix)
         summary = f"{viewed.name}: {len(viewed.landmarks):,} landmarks"
         if self.record is not None:
-            from wheretolook.view.recording import record
-
             record(viewed, self.record, state)
             print(f"{summary}, in {time.monotonic() - start:.0f} s: {self.record}")
         elif self.film is not None:
@@ -129,44 +138,13 @@ class View(CameraOptions, FrameOptions):
             print(f"{summary}, {n_frames} pictures in {time.monotonic() - start:.0f} s: {self.film}")
         else:
             print(f"{summary}, open after {time.monotonic() - start:.1f} s", flush=True)
-            self._serve(viewed, state)
-
-    def _serve(self, viewed: ViewedMap, state: ViewState) -> None:
-        from wheretolook.view.server import Viewer
-
-        viewer = Viewer(viewed, self.host, self.port, state, self.dark)
-        print(
-            viewed.weights.describe(state.method or viewed.weights.methods[0]) or "a method without weights", flush=True
-        )
-        print(f"http://{viewer.address}    (Ctrl-C ends it)", flush=True)
-        try:
-            viewer.wait()
-        except KeyboardInterrupt:
-            print("ended")
-        finally:
-            viewer.stop()
-
-    def _check_environment(self) -> None:
-        """Raise ConfigError for missing scenes, folders, packages and ports, before long imports."""
-        from wheretolook.dataset.layout import find_scene
-
-        if self.scene is not None and self.data.is_dir():
-            find_scene(self.data, self.scene, self.name)
-        from wheretolook.utils.package import require
-        from wheretolook.view.server import check_port
-
-        if self.record is not None:
-            require("rerun")
-        elif self.film is None:
-            check_port(self.host, self.port)
-
-    def _open(self) -> ViewedMap:
-        from wheretolook.utils.devices import usable_device
-        from wheretolook.view.viewed_map import open_map, open_scene
-
-        device = usable_device(self.device)
-        camera = self.named_camera()
-        if self.map is not None:
-            return open_map(self.map, self.mesh, camera, self.weights, device, self.data, self.frame_options())
-        assert self.scene is not None and not isinstance(camera, int)
-        return open_scene(self.data, self.scene, self.name, camera, self.weights, device)
+            viewer = Viewer(viewed, self.host, self.port, state, self.dark)
+            weights = viewed.weights.describe(state.method or viewed.weights.methods[0])
+            print(weights or "a method without weights", flush=True)
+            print(f"http://{viewer.address}    (Ctrl-C ends it)", flush=True)
+            try:
+                viewer.wait()
+            except KeyboardInterrupt:
+                print("ended")
+            finally:
+                viewer.stop()

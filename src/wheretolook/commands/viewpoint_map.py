@@ -9,6 +9,7 @@ from wheretolook.commands.map import SceneOrMapOptions, imports_map
 from wheretolook.commands.options import Log, Progress, ignore_progress, load_dataset, naming_file, open_scene
 from wheretolook.dataset.dataset_lock import reads_dataset
 from wheretolook.planning.config import ViewpointMapConfig
+from wheretolook.scorers.weights import resolve_weights
 from wheretolook.utils.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -50,7 +51,6 @@ class BuildViewpointMap(SceneOrMapOptions):
             SceneError: there is no mesh, or no voxel is free. MapFormatError: the map's folder holds something else.
         """
         from wheretolook.planning.scene_map import scene_scorer, scene_viewpoint_map
-        from wheretolook.scorers.weights import resolve_weights
 
         dataset = load_dataset(self, "map")
         config = self.viewpoint_map

@@ -291,7 +291,7 @@ class MapConfig:
     """
 
     n_images: int = 100
-    extractor: ExtractorConfig = field(default_factory=ExtractorConfig)
+    extractor: ExtractorConfig = no_option(ExtractorConfig())
     two_view_landmarks: bool = no_option(True)
     max_reprojection_error_px: float = no_option(0.5)
     camera: CameraConfig | None = None

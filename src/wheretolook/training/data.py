@@ -104,7 +104,6 @@ class TensorViews:
 
 
 BLOCK = 4096  # views binned at a time
-GPU_MEMORY_FACTOR = 2  # views are stored on a GPU with this many times the memory they need
 Ints = NDArray[np.int64]
 
 
@@ -129,7 +128,8 @@ class LabelledViews(TensorViews):
 
 def fits_on_gpu(device: torch.device | str, n_bytes: int) -> bool:
     """Return whether a device is a GPU with memory for views of so many bytes and for training on them."""
-    return torch.device(device).type == "cuda" and torch.cuda.mem_get_info(device)[0] > GPU_MEMORY_FACTOR * n_bytes
+    # views are stored on a GPU with twice the memory they need
+    return torch.device(device).type == "cuda" and torch.cuda.mem_get_info(device)[0] > 2 * n_bytes
 
 
 def load_views(

@@ -31,8 +31,6 @@ from wheretolook.training.data import Batch
 from wheretolook.utils.errors import ConfigError, TrackingError, WorkerError
 from wheretolook.utils.files import temporary_folder
 
-CALIBRATION_BINS = 15  # equal-width bins of the expected calibration error (Guo et al., ICML 2017)
-
 
 def weighted_bce(
     logits: Tensor, labels: Tensor, class_weights: tuple[float, float], count: float | None = None
@@ -129,13 +127,14 @@ class ViewpointClassifier(LightningModule):
         bce = weighted_bce(logits, labels, self.class_weights)
         penalty = self._penalty()
         views: dict[str, Any] = {"preds": logits.sigmoid(), "target": labels.long(), "validate_args": False}
+        # equal-width bins of the expected calibration error (Guo et al., ICML 2017)
         values = {
             "val_loss": bce + penalty,
             "val_bce": bce,
             "l2": penalty,
             "val_average_precision": binary_average_precision(**views),
             "val_roc_auc": binary_auroc(**views),
-            "val_calibration_error": binary_calibration_error(**views, n_bins=CALIBRATION_BINS, norm="l1"),
+            "val_calibration_error": binary_calibration_error(**views, n_bins=15, norm="l1"),
         }
         self._log(values)
 
@@ -173,7 +172,6 @@ class ViewpointClassifier(LightningModule):
 
 
 MONITORED = "val_average_precision"  # the metric that decides which epoch was best
-LOG_EVERY_S = 2.0  # epochs are logged together after so many seconds: a transaction takes longer than a short epoch
 
 
 def home_device(config: SharedConfig) -> str:
@@ -239,7 +237,8 @@ class RunLog:
     def add(self, epoch: int, metrics: dict[str, float]) -> None:
         """Log the finite metrics of an epoch, now or soon."""
         self._pending.append((epoch, metrics))
-        if time.monotonic() - self._flushed > LOG_EVERY_S:
+        # epochs are logged together: a transaction takes longer than a short epoch
+        if time.monotonic() - self._flushed > 2.0:
             self.flush()
 
     def flush(self) -> None:

@@ -29,11 +29,6 @@ from wheretolook.training.trained_network import TrainingRange, camera_quantitie
 
 DISTANCES = [ATTRIBUTES.index(name) for name in OF_SIZE]
 
-CORRECT_WITHIN = 0.5, 5.0
-"""Largest errors in metres and degrees of a localized pose whose inliers count as correct matches."""
-
-BLOCK = 2048  # views described at a time: some million landmarks
-
 
 @dataclass(frozen=True, eq=False)
 class LandmarkViews(TensorViews):
@@ -79,7 +74,8 @@ def load_landmark_views(
     with tqdm(total=sum(map(len, tables)), desc="describe views", unit="view", disable=not progress) as bar:
         for number, (scene, table) in enumerate(zip(scenes, tables, strict=True)):
             describer = LandmarkDescriber(scene.localization_map(device=device))
-            for camera, rows in views_by_camera(scene, table, BLOCK):
+            # 2,048 views have some million landmarks
+            for camera, rows in views_by_camera(scene, table, 2048):
                 block = table.iloc[rows].assign(scene=number)
                 described = describer.of_camera(camera).describe(poses(block))
                 kept = _sample(described, max_landmarks, generator)
@@ -114,7 +110,8 @@ def _detected(described: ViewLandmarks, table: pd.DataFrame) -> Tensor:
     starts = described.starts.cpu().numpy()
     detected = np.zeros(len(rows), dtype=bool)
     localized = (table["status"] == LOCALIZED).to_numpy()
-    correct = is_good(table, *CORRECT_WITHIN)
+    # inliers of a pose that is localized within 50 cm and 5 degrees count as correct matches
+    correct = is_good(table, 0.5, 5.0)
     for view, (inliers, matched) in enumerate(zip(table["inlier_rows"], table["matched_rows"], strict=True)):
         part = slice(starts[view], starts[view + 1])
         if correct[view] or not localized[view]:

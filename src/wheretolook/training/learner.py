@@ -71,8 +71,11 @@ def train_network(
     fit(classifier, data, record, task.config)
     metrics = record.restore(classifier)
     network.eval()
-    calibration = fit_platt(*_predict(network, data)) if calibrate else (1.0, 0.0)
-    model = TrainedNetwork(task.method, network.cpu(), task.camera, *calibration, data.training_range)
+    scale, offset = 1.0, 0.0
+    if calibrate:
+        logits, labels = _predict(network, data)
+        scale, offset = fit_platt(logits, labels)
+    model = TrainedNetwork(task.method, network.cpu(), task.camera, scale, offset, data.training_range)
     counts = class_counts(train=data.labels(data.train_rows), val=data.labels(data.val_rows))
     return TrainingResult(model, metrics, counts, pd.DataFrame(record.rows))
 

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 from wheretolook.dataset.config import RELEASE_FILE
 from wheretolook.dataset.layout import Dataset, SceneFolder
 from wheretolook.features.extractor import SIFT
+from wheretolook.mapping.landmarks import read_feature_name
 from wheretolook.tracking.runs import AUC
 from wheretolook.training.config import DECIDING, SharedConfig
 from wheretolook.training.scenes import with_also
@@ -71,8 +72,6 @@ def about_training(dataset: Dataset, method: str, config: SharedConfig, options:
 
     The dataset includes the scenes of `train.also`, see `with_also`; `options` are the method's own, a dataclass.
     """
-    from wheretolook.mapping.landmarks import read_feature_name
-
     shared = {name: getattr(config, name) for name in DECIDING}
     scenes = [scene for scene in dataset.scenes if scene.split != "test"]
     cameras = dataset.cameras

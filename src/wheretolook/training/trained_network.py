@@ -33,17 +33,14 @@ QUANTITIES = {
 }
 """Quantities of a view, NaN where unknown, and their text in messages. The mean distance is geometric."""
 
-LANDMARK_QUANTITIES = ("distance_m", "depth_m", "in_view")
 ANGLES = ("across_deg", "down_deg")
 DISTANCES = ("distance_m", "depth_m")
 
-QUANTILES = (0.005, 0.995)  # of the training views that bound the range
 MAX_DISTANCE_QUANTILE = 0.975
 """Of the training views, bounds distances from above. Three quarters of the farther ones are of three scenes, and scenes
 that are scaled in training show the same surfaces: neither covers spaces of that size."""
 MARGIN = 1.25  # factor that widens the range beyond these quantiles; for angles, degrees
 MARGIN_DEG = 2.0
-TOLERATED = 0.05  # share of the views scored at once that may be out of range without a warning
 
 
 @dataclass(frozen=True)
@@ -59,7 +56,8 @@ class TrainingRange:
         for name, values in zip(QUANTITIES, quantities[_have_landmarks(quantities)].T, strict=True):
             known = values[np.isfinite(values)]
             if len(known):
-                low, high = np.quantile(known, QUANTILES).tolist()
+                # quantiles of the training views bound the range
+                low, high = np.quantile(known, (0.005, 0.995)).tolist()
                 wider = (low - MARGIN_DEG, high + MARGIN_DEG) if name in ANGLES else (low / MARGIN, high * MARGIN)
                 if name in DISTANCES:
                     wider = low / MARGIN, float(np.quantile(known, MAX_DISTANCE_QUANTILE))
@@ -100,7 +98,7 @@ class TrainingRange:
     @property
     def bounds_landmarks(self) -> bool:
         """Whether the range bounds more than the camera."""
-        return any(name in self.bounds for name in LANDMARK_QUANTITIES)
+        return any(name in self.bounds for name in ("distance_m", "depth_m", "in_view"))
 
     @cached_property
     def _limits(self) -> Float:
@@ -148,7 +146,8 @@ class RangeWatch:
         """
         if not self.watching or not quantities:
             return
-        if complaint := training_range.complaint(np.concatenate(quantities), TOLERATED):
+        # as many of the views scored at once may be out of range without a warning
+        if complaint := training_range.complaint(np.concatenate(quantities), 0.05):
             self.watching = False
             text = f"{name}: {complaint}. Their scores are less reliable; Scorer.in_range returns which."
             warnings.warn(text, OutOfRangeWarning, stacklevel=3)
@@ -283,8 +282,9 @@ class TrainedNetwork(Generic[NetworkT]):
             fix = "Use the version that wrote them, or train again."
             raise WeightsError(problem, path=path, fix=fix) from error
         network.to(device).requires_grad_(False)
-        calibration = scale, offset, training_range, accuracy, photograph_offset
-        return TrainedNetwork(header["method"], network, camera, *calibration)
+        return TrainedNetwork(
+            header["method"], network, camera, scale, offset, training_range, accuracy, photograph_offset
+        )
 
 
 def finite(value: Any) -> float:

@@ -18,7 +18,6 @@ if TYPE_CHECKING:
 
 FORMAT_VERSION = 1  # of the header
 METADATA_KEY = "wheretolook"  # of the header's JSON text in the safetensors metadata
-MAX_MAGNITUDE = 1e12  # of a weight; the coordinates in scene-adapted weights are far smaller
 
 
 def write_weights(path: str | Path, method: str, tensors: Mapping[str, Tensor], header: Mapping[str, Any]) -> None:
@@ -41,7 +40,8 @@ def read_weights(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
         names = file.keys()  # the file is no dict, whatever it looks like
         tensors = {name: file.get_tensor(name) for name in names}
     for name, tensor in tensors.items():
-        if tensor.is_floating_point() and not (tensor.abs() <= MAX_MAGNITUDE).all():
+        # the coordinates in scene-adapted weights are far smaller
+        if tensor.is_floating_point() and not (tensor.abs() <= 1e12).all():
             raise WeightsError("these weights are NaN or too large", path=path, value=name, fix="Train again.")
     return tensors, header
 

@@ -8,11 +8,15 @@ from functools import cache
 from typing import Any
 
 import numpy as np
+from matplotlib import colormaps
 from numpy.typing import ArrayLike, NDArray
+from PIL import Image, ImageDraw
+from scipy.spatial import ConvexHull
 
 from wheretolook.geometry.camera import Camera, PinholeCamera
 from wheretolook.geometry.mesh import TexturedMesh, cut_above
 from wheretolook.geometry.poses import Float, invert_poses
+from wheretolook.scenes.loading import glb_bytes
 
 Rgb = NDArray[np.uint8]
 
@@ -45,8 +49,6 @@ def escape_markdown(text: str) -> str:
 
 @cache
 def _colormap() -> Any:
-    from matplotlib import colormaps
-
     return colormaps["cividis"].with_extremes(bad=f"#{bytes(UNKNOWN).hex()}")
 
 
@@ -73,7 +75,7 @@ def line_ends(colors: Any) -> Rgb:
 
 def legend(low: float, high: float, quantity: str = "score") -> str:
     """Return the colour scale of a quantity as HTML."""
-    stops = ",".join("rgb({},{},{})".format(*color) for color in score_colors(np.linspace(0, 1, 18)))
+    stops = ",".join(f"rgb({red},{green},{blue})" for red, green, blue in score_colors(np.linspace(0, 1, 18)))
     bar = f"height:10px;border-radius:3px;background:linear-gradient(to right,{stops})"
     row = "display:flex;justify-content:space-between;font-size:12px;opacity:.8"
     ends = f"<span>{low:.3g}</span><span>{quantity}</span><span>{high:.3g}</span>"
@@ -97,10 +99,6 @@ def floor_image(raster: Float, low: float, high: float, threshold: float | None)
 
 def sphere_glb(directions: Float, scores: Float, low: float, high: float, radius_m: float) -> bytes:
     """Return a sphere around the origin as GLB, coloured by the score of each direction (D, 3)."""
-    from scipy.spatial import ConvexHull
-
-    from wheretolook.scenes.loading import glb_bytes
-
     triangles = ConvexHull(directions).simplices
     a, b, c = np.moveaxis(directions[triangles], 1, 0)
     inward = (np.cross(b - a, c - a) * a).sum(1) < 0
@@ -118,10 +116,6 @@ def sphere_glb(directions: Float, scores: Float, low: float, high: float, radius
 
 def mesh_glb(mesh: TexturedMesh, cut_m: float | None) -> bytes:
     """Return the mesh below a height as GLB, its textures scaled down to MAX_TEXTURE_PX."""
-    from PIL import Image
-
-    from wheretolook.scenes.loading import glb_bytes
-
     textures = [Image.fromarray(texture) for texture in mesh.textures]
     for texture in textures:
         texture.thumbnail((MAX_TEXTURE_PX, MAX_TEXTURE_PX))
@@ -164,8 +158,6 @@ class VisibleLandmarks:
 
 def picture(rgb: Rgb | None, camera: Camera, visible: VisibleLandmarks) -> Rgb:
     """Draw visible landmarks in the colours of their probabilities on an image or a plain ground; (H, PICTURE_PX, 3)."""
-    from PIL import Image, ImageDraw
-
     scale = PICTURE_PX / camera.width
     size = (PICTURE_PX, max(1, round(camera.height * scale)))
     ground = Image.new("RGB", size, (38, 40, 46)) if rgb is None else Image.fromarray(rgb).resize(size)

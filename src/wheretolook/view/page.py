@@ -31,13 +31,6 @@ if TYPE_CHECKING:
 
     from wheretolook.geometry.views import Views
 
-MARKERS = ("/sphere", "/view", "/views", "/turn", "/seen")  # hidden while the browser's camera is inside
-SETTLE_S = 0.3  # camera motion this soon after the program moved the camera is not by hand
-REDRAW_S = 0.4  # between two images of a growing floor
-CELLS_PER_STEP = 2  # one per core
-MESH_LOADING_S = 1.5  # until a browser has loaded a mesh
-MAX_LANDMARKS = 400_000
-
 
 class LocationView:
     """Draws and reports the selected location and view of a session."""
@@ -180,13 +173,15 @@ class LocationView:
                 position, look_at, camera.fov = self._outside
                 camera.position = position
                 camera.look_at = look_at
-        for name in MARKERS:
+        # hidden while the browser's camera is inside
+        for name in ("/sphere", "/view", "/views", "/turn", "/seen"):
             if (handle := session.scene.get_handle_by_name(name)) is not None:
                 handle.visible = not inside
 
     def camera_moved(self) -> None:
         """Turn the view with the browser's camera while that is inside."""
-        if self.session.controls.inside.value and time.monotonic() - self._camera_set > SETTLE_S:
+        # motion within 0.3 s after the program moved the camera is not by hand
+        if self.session.controls.inside.value and time.monotonic() - self._camera_set > 0.3:
             self.turn_to(rotation_from_quaternion(self.session.client.camera.wxyz)[:, 2])
 
 
@@ -230,7 +225,7 @@ class Scenery:
         points = self.viewed.landmarks.points
         if cut is not None:
             points = points[points[:, 2] <= cut]
-        stride = max(1, -(-len(points) // MAX_LANDMARKS))
+        stride = max(1, -(-len(points) // 400_000))
         points = points[::stride] if layers["landmarks"] else points[:0]
         self.session.add_points("/landmarks", points, drawing.LANDMARK_COLOR, 0.0018 * self.viewed.size_m)
         poses = self.viewed.mapping_poses
@@ -254,7 +249,8 @@ class Scenery:
             self._mesh_name = "/mesh/a" if old != "/mesh/a" else "/mesh/b"
             self.scene.add_glb(self._mesh_name, mesh, cast_shadow=False, receive_shadow=False)
         if old:
-            timer = threading.Timer(MESH_LOADING_S if mesh is not None else 0.0, self._remove_mesh, (old,))
+            # the time until a browser has loaded a mesh
+            timer = threading.Timer(1.5 if mesh is not None else 0.0, self._remove_mesh, (old,))
             timer.daemon = True
             timer.start()
 
@@ -284,8 +280,8 @@ class Scenery:
             return
         yield
         drawn = 0.0
-        while floor.score_next(CELLS_PER_STEP):
-            if floor.n_scored >= FIRST_CELLS and time.monotonic() - drawn > REDRAW_S:
+        while floor.score_next(2):
+            if floor.n_scored >= FIRST_CELLS and time.monotonic() - drawn > 0.4:
                 self._color_floor(floor, state)
                 drawn = time.monotonic()
             yield
@@ -293,8 +289,8 @@ class Scenery:
 
     def _color_floor(self, floor: Floor, state: ViewState) -> None:
         """Draw a floor and its colour scale, and report how much of it is good."""
-        score_range = self.viewed.score_range(state.method, floor.scores)
-        self.controls.legend.content = drawing.legend(*score_range)
+        low, high = self.viewed.score_range(state.method, floor.scores)
+        self.controls.legend.content = drawing.legend(low, high)
         status = f"**{state.method}**: {floor.n_scored:,} of {len(floor.cells):,} locations"
         threshold = None
         if self.viewed.is_probability(state.method):
@@ -303,7 +299,7 @@ class Scenery:
                 f", at least {threshold:.2f} at {100 * np.mean(floor.scores[: floor.n_scored] >= threshold):.0f} %"
             )
         self.controls.status.content = status
-        image = drawing.floor_image(floor.raster(), *score_range, threshold)
+        image = drawing.floor_image(floor.raster(), low, high, threshold)
         handle: Any = self.scene.get_handle_by_name("/floor")
         if self._floor is floor and handle is not None:
             handle.image = image
@@ -329,6 +325,7 @@ class Scenery:
             self.scene.remove_by_name("/labels")
             self.controls.label_summary.content = ""
             return
+
         from wheretolook.dataset.viewpoint_table import is_good, poses
 
         cam_from_world = poses(table)

@@ -24,7 +24,6 @@ from wheretolook.view.state import ViewState
 from wheretolook.view.viewed_map import ViewedMap
 
 LOCAL = ("localhost", "127.0.0.1", "::1")  # names of this machine, unreachable from others
-HEADERS = ("Host", "Origin", "X-Forwarded-Host")
 
 _log = logging.getLogger(__name__)
 
@@ -153,7 +152,11 @@ def _request(server: Any, client_id: int) -> tuple[str, Mapping[str, str]]:
     """Return path and headers of a client's request, from private fields of viser."""
     try:
         request = server._websock_server._live_connections[client_id].request
-        return request.path, {name: request.headers.get_all(name)[0] for name in HEADERS if name in request.headers}
+        return request.path, {
+            name: request.headers.get_all(name)[0]
+            for name in ("Host", "Origin", "X-Forwarded-Host")
+            if name in request.headers
+        }
     except (AttributeError, KeyError):  # another version of viser; links then open without their state
         return "", {}
 

@@ -41,7 +41,6 @@ LIMITS = {threshold_label(threshold_key(limits)): limits for limits in THRESHOLD
 STEP_M = 0.05  # of heights
 _BLANK = np.full((270, 360, 3), (38, 40, 46), np.uint8)
 
-HEADROOM_M = 0.35  # above the floor, where a mesh is cut by default
 NOTICE_S = 0.5  # minimum time between two error notifications
 
 _log = logging.getLogger(__name__)
@@ -248,7 +247,8 @@ class Session:
         self.state = viewed.complete(state)
         if state.cut is None and viewed.mesh is not None:
             top = float(viewed.mesh.bounds[1, 2])
-            self.state = replace(self.state, cut=min((self.state.height or 0.0) + HEADROOM_M, top))
+            # a mesh is cut above the camera by default
+            self.state = replace(self.state, cut=min((self.state.height or 0.0) + 0.35, top))
         self.location: ScoredLocation | None = None  # selected
         self.controls = Controls(client.gui, viewed, self.state)
         self.closed = False

@@ -13,17 +13,16 @@ from numpy.typing import NDArray
 
 from wheretolook.geometry.poses import Float, camera_centers, poses_looking_along
 from wheretolook.geometry.similarity import Similarity
+from wheretolook.geometry.views import Views
 from wheretolook.mapping.map_frame import IDENTITY
+from wheretolook.planning.config import FORWARD
 from wheretolook.utils.errors import ConfigError, TableError
+from wheretolook.utils.files import read_parquet
 
 MAX_VIEWS = 20
 MAX_NUMBER = 1e9
-_MAX_LENGTH = 2000  # characters
 _STATE_FIX = "Copy it from the field `state` of the viewer, such as n=3;height=1.4;place=1,2,1.5."
 
-GOOD_M = 0.25
-GOOD_DEG = 2.0
-"""Errors of a view below which it counts as localized, as in compared paths."""
 MAX_POSES = 5000
 MAX_METHODS = 20
 _PATH_FIX = """\
@@ -64,7 +63,7 @@ class ViewState:
     @classmethod
     def parse(cls, text: str) -> Self:
         """Parse the text of a state. Raises ConfigError for an unknown field or an invalid value."""
-        if len(text) > _MAX_LENGTH:
+        if len(text) > 2000:
             raise ConfigError("the state is too long", value=f"{text[:60]}...", fix=_STATE_FIX)
         values: dict[str, object] = {}
         for part in filter(None, text.split(";")):
@@ -131,9 +130,6 @@ def read_paths(path: Path, pair: int = 0, world_from_map: Similarity = IDENTITY.
     Poses are moved from the map's own frame to the world. A single path is accompanied by `FORWARD`: the same locations
     seen by a camera that looks ahead. Raises TableError if the file is missing or has no valid poses.
     """
-    from wheretolook.geometry.views import Views
-    from wheretolook.planning.config import FORWARD
-
     if path.is_dir():
         path = next((path / name for name in ("path.csv", "views.parquet") if (path / name).is_file()), path)
     if path.suffix == ".parquet":
@@ -169,7 +165,6 @@ def looking_ahead(positions: Float) -> Float:
 def _compared_paths(path: Path, pair: int) -> Paths:
     """Read the paths that every method planned, or its views along the given path if any method planned none."""
     from wheretolook.dataset.viewpoint_table import UNLABELLED, is_good, poses
-    from wheretolook.utils.files import read_parquet
 
     try:
         table = read_parquet(path)
@@ -186,7 +181,8 @@ def _compared_paths(path: Path, pair: int) -> Paths:
         for name in methods:
             rows = chosen[chosen["method"] == name]
             has_labels = "status" in rows and not (rows["status"] == UNLABELLED).any()
-            paths[str(name)] = RecordedPath(poses(rows), is_good(rows, GOOD_M, GOOD_DEG) if has_labels else None)
+            # a view counts as localized within 25 cm and 2 degrees, as in compared paths
+            paths[str(name)] = RecordedPath(poses(rows), is_good(rows, 0.25, 2.0) if has_labels else None)
         return paths
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise TableError(f"no path can be read: {error}", path=path, fix=_PATH_FIX) from error

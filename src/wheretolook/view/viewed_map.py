@@ -11,13 +11,18 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
+from safetensors import SafetensorError, safe_open
+from scipy.spatial import cKDTree
 
+from wheretolook.dataset.layout import Dataset, find_scene
 from wheretolook.dataset.scene import ColmapFiles, Scene, SceneConfig
 from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.lattices import direction_lattice
 from wheretolook.geometry.poses import Float, camera_centers
-from wheretolook.mapping.config import FrameOptions
+from wheretolook.mapping.config import FrameOptions, place_name
 from wheretolook.mapping.map_frame import IDENTITY, mesh_warning, warn_of_mesh
+from wheretolook.scorers.registry import check_method, make_scorer, scorers
+from wheretolook.scorers.weights import resolve_weights, weights_by_method
 from wheretolook.utils.errors import MapError, TableError, WhereToLookError
 from wheretolook.utils.package import WEIGHTS, or_shipped, shipped
 from wheretolook.view import drawing
@@ -33,20 +38,14 @@ if TYPE_CHECKING:  # torch and Warp are imported when first needed: the page ope
     from wheretolook.scorers.base import Scorer
     from wheretolook.select.where_to_look import WhereToLook
 
-FLOOR_CELLS = 1200  # approximate number of cells in a floor's rectangle
-MIN_CELL_M = 0.1
 FLOOR_DIRECTIONS = 96
 """Directions per cell of a floor, 19 degrees apart: the best score is within 0.02 of that of 500 directions, in a third
 of the time."""
 
 FIRST_CELLS = 12  # scored before a floor is drawn
-ABOVE_GROUND_M = 0.03  # above carpets
 BLOCK = 1 << 10  # labelled views scored per step
 
 MAX_SCORERS = 8  # kept in memory; those of large maps take 100 MB each
-MAX_FLOORS = 64
-MAX_MESHES = 4
-DIRECTIONS = 500  # scored at a location, as by `wheretolook select`
 OCCLUSION_BYTES = 1 << 26  # memory for cached lines of sight
 
 
@@ -89,8 +88,6 @@ class Floor:
 
     def raster(self) -> Float:
         """Return scores (rows, columns), NaN outside free space; cells not yet scored have the nearest one's score."""
-        from scipy.spatial import cKDTree
-
         values = np.full(self.shape, np.nan)
         if self.n_scored:
             _, nearest = cKDTree(self.points[: self.n_scored]).query(self.points)
@@ -105,7 +102,8 @@ def floor_at(selector: WhereToLook, height_m: float) -> Floor:
     """
     space = selector.space
     low, high = np.asarray(space.bounds, dtype=np.float64)[:, :2]
-    cell = max(MIN_CELL_M, float(np.sqrt(np.prod(high - low) / FLOOR_CELLS)))
+    # about 1,200 cells in a floor's rectangle
+    cell = max(0.1, float(np.sqrt(np.prod(high - low) / 1200)))
     columns, rows = (max(1, ceil(length)) for length in (high - low) / cell)
     lower = (low + high) / 2 - np.array([columns, rows]) * cell / 2
     floor = Floor(selector, height_m, lower, cell, (rows, columns), np.arange(rows * columns), height_m)
@@ -114,7 +112,8 @@ def floor_at(selector: WhereToLook, height_m: float) -> Floor:
     cells = np.flatnonzero(free)
     drawn_m = height_m
     if len(cells) and hasattr(space, "floor_below"):
-        drawn_m = float(np.median(space.floor_below(floor.points[cells]))) + ABOVE_GROUND_M
+        # above carpets
+        drawn_m = float(np.median(space.floor_below(floor.points[cells]))) + 0.03
     order = farthest_first(np.stack(np.divmod(cells, columns), axis=1))
     return Floor(selector, height_m, lower, cell, (rows, columns), cells[order], drawn_m)
 
@@ -173,8 +172,6 @@ class AvailableWeights:
     """
 
     def __init__(self, features: str, own: Mapping[str, Path | None]) -> None:
-        from wheretolook.scorers.weights import weights_by_method
-
         self.files: dict[str, Path] = {}
         self.origins: dict[str, str] = {}
         for origin, place in {**own, "bundled with wheretolook": shipped(WEIGHTS)}.items():
@@ -185,16 +182,12 @@ class AvailableWeights:
 
     def describe(self, method: str) -> str:
         """Describe the weights that a method scores with; empty for a method without weights."""
-        from wheretolook.scorers.registry import scorers
-
         kind = scorers()[method].weights
         return f"weights {self.origins[kind]}: {self.files[kind].name}" if kind in self.files else ""
 
     @property
     def methods(self) -> tuple[str, ...]:
         """Methods that can score with these weights or without any, the preferred one first."""
-        from wheretolook.scorers.registry import scorers
-
         usable = [
             name
             for name, method in scorers().items()
@@ -209,9 +202,6 @@ def scene_weights(files: SceneFolder, landmarks: Landmarks) -> dict[str, Path | 
     root = files.folder.parent
     trained = None
     if any((root / "weights").glob("*.safetensors")):
-        from wheretolook.dataset.layout import Dataset
-        from wheretolook.scorers.weights import resolve_weights
-
         trained = resolve_weights(dataset=Dataset.load(root))
         if trained is not None and not trained.is_relative_to(root):
             trained = None
@@ -221,8 +211,6 @@ def scene_weights(files: SceneFolder, landmarks: Landmarks) -> dict[str, Path | 
 
 def map_weights(model: Path, data: Path, landmarks: Landmarks) -> dict[str, Path | None]:
     """Find weights adapted to a COLMAP model by `wheretolook adapt --map`."""
-    from wheretolook.mapping.config import place_name
-
     path = data / "checks" / place_name(model) / "adapted.safetensors"
     return {"adapted to this scene": _if_adapted_to(path, landmarks)}
 
@@ -231,15 +219,13 @@ def _if_adapted_to(path: Path, landmarks: Landmarks) -> Path | None:
     """Return the path if the file has weights adapted to a scene with these landmarks."""
     if not path.is_file():
         return None
-    from safetensors import SafetensorError, safe_open
-
-    from wheretolook.scorers.adapted.score import MIN_SHARE, share_of_place
-
     try:
         with safe_open(path, framework="np") as file:
             place = file.get_tensor("place")
     except (SafetensorError, OSError):
         return None
+    from wheretolook.scorers.adapted.score import MIN_SHARE, share_of_place  # loads PyTorch
+
     return path if share_of_place(place, landmarks.points) >= MIN_SHARE else None
 
 
@@ -295,8 +281,6 @@ class ViewedMap:
 
     def is_probability(self, method: str) -> bool:
         """Test whether a method's scores are probabilities, which a threshold applies to."""
-        from wheretolook.scorers.registry import check_method
-
         return check_method(method).probability
 
     def score_range(self, method: str, scores: Float) -> tuple[float, float]:
@@ -306,17 +290,16 @@ class ViewedMap:
     # caches are shared by all maps of a process: usually it shows one
 
     @lru_cache(MAX_SCORERS)  # noqa: B019
-    def selector(self, method: str, occlusion: str, directions: int = DIRECTIONS) -> WhereToLook:
+    def selector(self, method: str, occlusion: str, directions: int = 500) -> WhereToLook:
         """Return the view selector of a method and an occlusion model.
 
         Scorers cache what depends on the directions, so each number of directions has its own. Raises ConfigError for
         an unknown method or occlusion model, WeightsError if the weights cannot be used.
         """
-        from wheretolook.scorers.registry import check_method, make_scorer
-        from wheretolook.select.where_to_look import WhereToLook
-
         weights = self.weights.files.get(check_method(method).weights)
         scorer = make_scorer(method, self._localization_map(occlusion), weights=weights)
+        from wheretolook.select.where_to_look import WhereToLook  # loads PyTorch: the page opens before it does
+
         return WhereToLook(scorer, direction_lattice(directions), self.space)
 
     @lru_cache(MAX_SCORERS)  # noqa: B019
@@ -324,12 +307,12 @@ class ViewedMap:
         opened = self.scene.with_occlusion(self.scene.occlusion_model(occlusion))
         return replace(opened, map=replace(opened.map, frame=IDENTITY))  # the viewer selects in the world
 
-    @lru_cache(MAX_FLOORS)  # noqa: B019
+    @lru_cache(64)  # noqa: B019
     def floor(self, method: str, occlusion: str, height_m: float) -> Floor:
         """Return the floor at a height, one object for all clients."""
         return floor_at(self.selector(method, occlusion, FLOOR_DIRECTIONS), height_m)
 
-    @lru_cache(MAX_MESHES)  # noqa: B019
+    @lru_cache(4)  # noqa: B019
     def mesh_glb(self, cut_m: float | None) -> bytes | None:
         """Return the mesh below a height as GLB; None without a mesh."""
         return None if self.mesh is None else drawing.mesh_glb(self.mesh, cut_m)
@@ -411,9 +394,6 @@ def open_scene(
     `dataset.layout.find_scene`, MapError or TableError if the scene has not been mapped, WeightsError if the weights
     cannot be used.
     """
-    from wheretolook.dataset.layout import find_scene
-    from wheretolook.dataset.viewpoint_table import CAMERA_ID, UNLABELLED
-
     if not data.is_dir():
         fix = "Make a scene first, such as by `wheretolook demo`, or name a model: --map SPARSE."
         raise TableError("there is no such folder of datasets", path=data, fix=fix)
@@ -428,6 +408,8 @@ def open_scene(
     labels = None
     if camera is None and files.table.is_file():
         table = files.read_table()
+        from wheretolook.dataset.viewpoint_table import CAMERA_ID, UNLABELLED
+
         shown = table["status"] != UNLABELLED
         if CAMERA_ID in table:
             shown &= table[CAMERA_ID] == number

@@ -117,7 +117,10 @@ def release_settings(options: Experiment) -> dict[str, Any]:
     }
     settings = {name: _record(group) for name, group in groups.items()}
     settings = {"camera": options.camera.camera.record(), **settings}
-    settings["scenes"]["meshes"] = meshes
+    settings["scenes"] |= {"meshes": meshes, "free_space": asdict(options.free_space)}
+    settings["scenes"]["mapped_space"] = asdict(options.mapped_space)
+    settings["mapping"] |= {"camera": options.mapping.camera and asdict(options.mapping.camera)}
+    settings["mapping"] |= {"draw_camera": options.mapping.draw_camera, "extractor": options.extractor.record()}
     settings["label"] = {"localizer": options.label.localizer.record()}
     for name in ("appearance", "changes"):
         if getattr(options.label, name):

@@ -216,7 +216,7 @@ def compare_policies(options: Relocalize, dataset: Dataset, scenes: Sequence[Sce
 def _robot(options: Relocalize, dataset: Dataset, files: SceneFolder, log: Log) -> SimulatedRobot:
     scene = open_scene(options, files)
     weights = resolve_weights(options.method, options.weights, dataset=dataset, log=log)
-    extractor = extractor_of(files, options.mapping.extractor)
+    extractor = extractor_of(files, options.extractor)
     return SimulatedRobot(scene, scene_scorer(scene, options.method, weights), extractor)
 
 

@@ -352,7 +352,7 @@ def _comparisons(options: ComparePaths, dataset: Dataset, log: Log) -> list[Scen
     comparisons = []
     for files in scenes:
         scene = open_scene(options, files)
-        extractor = extractor_of(files, options.mapping.extractor)
+        extractor = extractor_of(files, options.extractor)
         label = options.label
         made_from = files.mesh, files.landmarks, scene.camera, label.localizer, extractor, scene.device
         job = SceneJob(*made_from, appearance=label.appearance)

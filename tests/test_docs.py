@@ -1,14 +1,11 @@
 """The documentation: it builds without a warning, its code runs, its commands are real, its numbers the release's."""
 
-from __future__ import annotations
-
 import re
 import shlex
 import shutil
 import subprocess
 import sys
 import tomllib
-from collections.abc import Iterator
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -39,7 +36,7 @@ BLOCK = re.compile(NOT_RUN + r"^```(?P<language>\w*)\n(?P<code>.*?)^```$", re.M 
 CHECKED = ("python", "sh")  # in these languages; in others, such as text and toml, there is nothing to run
 
 
-def blocks(page: Path, language: str) -> list[str]:
+def blocks(page, language):
     """Blocks of code of a page in a language, but for those that say why they are not run."""
     found = list(BLOCK.finditer(page.read_text()))
     return [block["code"] for block in found if block["language"] == language and block["why"] is None]
@@ -49,7 +46,7 @@ def blocks(page: Path, language: str) -> list[str]:
 
 
 @pytest.mark.skipif(find_spec("mkdocs") is None, reason="mkdocs is not installed: pip install '.[docs]'")
-def test_the_site_builds_without_a_warning(tmp_path: Path) -> None:
+def test_the_site_builds_without_a_warning(tmp_path):
     command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path / "site")]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
@@ -64,7 +61,7 @@ def test_the_site_builds_without_a_warning(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("page", PAGES, ids=NAMES)
-def test_links_lead_to_files_and_headings(page: Path) -> None:
+def test_links_lead_to_files_and_headings(page):
     links = re.findall(r"\]\((?!https?:|mailto:)([^)\s#]*)(?:#([^)\s]+))?\)", page.read_text())
     for target, heading in links:
         path = page.parent / target if target else page
@@ -79,7 +76,7 @@ def test_links_lead_to_files_and_headings(page: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def users_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def users_folder(tmp_path_factory):
     """Return a folder with what the pages expect: a model, a mesh, depth images, waypoints, the release."""
     folder = tmp_path_factory.mktemp("user")
     mesh = furnished_room()
@@ -97,10 +94,10 @@ def users_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.filterwarnings("ignore::UserWarning")
 @pytest.mark.parametrize("page", [page for page in PAGES if blocks(page, "python")], ids=lambda page: page.name)
-def test_python_blocks_run(page: Path, users_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_python_blocks_run(page, users_folder, tmp_path, monkeypatch):
     shutil.copytree(users_folder, tmp_path / "user", symlinks=True)
     monkeypatch.chdir(tmp_path / "user")
-    names: dict[str, object] = {"__name__": page.stem}
+    names = {"__name__": page.stem}
     for code in blocks(page, "python"):
         exec(compile(code, str(page), "exec"), names)  # blocks of a page build on one another
     if page.name in ("README.md", "quickstart.md"):
@@ -112,14 +109,14 @@ def test_python_blocks_run(page: Path, users_folder: Path, tmp_path: Path, monke
 # --- shell blocks: options are real
 
 
-def commands(page: Path) -> list[list[str]]:
+def commands(page):
     """Commands of a page's shell blocks, without comments and settings of the environment."""
     found = []
     for code in blocks(page, "sh"):
         for line in code.replace("\\\n", " ").splitlines():
             lexer = shlex.shlex(line, posix=True, punctuation_chars="&|;")
             lexer.whitespace_split = True
-            words: list[str] = []
+            words = []
             for word in [*lexer, ";"]:
                 if set(word) <= set("&|;"):
                     found.append(words)
@@ -129,7 +126,7 @@ def commands(page: Path) -> list[list[str]]:
     return [words for words in found if words]
 
 
-def check_wheretolook(arguments: list[str]) -> None:
+def check_wheretolook(arguments):
     """Raise, or fail, if there is no such command or option."""
     command, *rest = arguments
     if {"--help", "--list", "--list-methods"} & {*rest}:
@@ -139,7 +136,7 @@ def check_wheretolook(arguments: list[str]) -> None:
 
 
 @pytest.mark.parametrize("page", [page for page in PAGES if blocks(page, "sh")], ids=lambda page: page.name)
-def test_shell_blocks_name_real_commands(page: Path) -> None:
+def test_shell_blocks_name_real_commands(page):
     Path("data").mkdir()
     Path("data", "release").symlink_to(ROOT / "data" / "release")
     makefile = (ROOT / "Makefile").read_text()
@@ -166,13 +163,13 @@ NUMBERS = Numbers(ROOT)
 
 
 @pytest.mark.parametrize("page", pages(NUMBERS))
-def test_numbers_are_those_of_the_results(page: str) -> None:
+def test_numbers_are_those_of_the_results(page):
     assert (ROOT / page).read_text() == updated(page, NUMBERS), (
         "python -m wheretolook_paper.studies.results --only '[pages]'"
     )
 
 
-def test_a_changed_result_changes_the_page(tmp_path: Path) -> None:
+def test_a_changed_result_changes_the_page(tmp_path):
     shutil.copytree(ROOT / "data" / "release" / "results", tmp_path / "data" / "release" / "results")
     shutil.copy(ROOT / "data" / "release" / "README.md", tmp_path / "data" / "release")
     shutil.copytree(ROOT / "docs", tmp_path / "docs")
@@ -184,7 +181,7 @@ def test_a_changed_result_changes_the_page(tmp_path: Path) -> None:
     assert text.count("| 12.3 |") == 7 and text != (ROOT / "docs" / "looks.md").read_text()
 
 
-def test_the_table_of_paths_on_photographs_is_that_of_the_release() -> None:
+def test_the_table_of_paths_on_photographs_is_that_of_the_release():
     table, landmarks = read_photograph_paths(Dataset.load(ROOT / "data" / "release"))
     page, made = (
         [[cell.strip() for cell in line.split("|")] for line in text.splitlines() if line[:2] == "| "]
@@ -198,13 +195,13 @@ def test_the_table_of_paths_on_photographs_is_that_of_the_release() -> None:
 # --- options
 
 
-def test_options_are_few_and_each_is_in_a_page_configuration_or_notebook() -> None:
+def test_options_are_few_and_each_is_in_a_page_configuration_or_notebook():
     sources = [*PAGES, *(ROOT / "docs" / "research").glob("*.md"), *(ROOT / "notebooks").glob("*.py")]
     text = "\n".join(path.read_text() for path in sources)
     configured = {
         name for path in (ROOT / "configs").glob("*.yaml") for name in dotted(yaml.safe_load(path.read_text()))
     }
-    options: dict[str, set[str]] = {}
+    options = {}
     for command in map(load_command, command_targets()):
         for name in command_options(command):
             options.setdefault(name, {name}).update(short for short, full in command.SHORT.items() if full == name)
@@ -217,7 +214,7 @@ def test_options_are_few_and_each_is_in_a_page_configuration_or_notebook() -> No
     assert missing == [] and len(options) <= 180
 
 
-def dotted(settings: dict[str, object], prefix: str = "") -> Iterator[str]:
+def dotted(settings, prefix=""):
     """Yield the dotted names of nested settings."""
     for key, value in settings.items():
         yield f"{prefix}{key}"
@@ -228,7 +225,7 @@ def dotted(settings: dict[str, object], prefix: str = "") -> Iterator[str]:
 # --- the public names
 
 
-def test_the_page_of_the_interface_lists_what_is_public() -> None:
+def test_the_page_of_the_interface_lists_what_is_public():
     documented = set()
     commands = set()
     for name, options in re.findall(

@@ -1,8 +1,5 @@
 """Degenerate maps, images of one pixel and requests that exceed the memory."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -18,9 +15,8 @@ from wheretolook.dataset.sampling import sample_viewpoints
 from wheretolook.dataset.sampling_config import SampleConfig
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.lattices import VoxelGrid, fibonacci_sphere
-from wheretolook.geometry.poses import Float, poses_looking_along, rotation_looking_along
+from wheretolook.geometry.poses import poses_looking_along, rotation_looking_along
 from wheretolook.inputs.localization_map import LocalizationMap
-from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.mapping.map import Map
 from wheretolook.planning.config import ViewpointMapConfig
 from wheretolook.planning.scene_map import build_viewpoint_map
@@ -39,12 +35,12 @@ FORWARD = np.array([(1.0, 0.0, 0.0)])
 WEIGHTS_OF = {"set": "set", "expected-inliers": "matchability", "mlp-2d+z": "mlp-2d+z"}
 
 
-def at(points: Float) -> Landmarks:
+def at(points):
     """Landmarks with made-up attributes at points (N, 3)."""
     return replace(make_landmarks(np.random.default_rng(0), len(points)), points=np.asarray(points, dtype=np.float64))
 
 
-def scores_of(method: str, localization_map: LocalizationMap, poses: Float) -> Float:
+def scores_of(method, localization_map, poses):
     weights = WEIGHTS / f"{WEIGHTS_OF[method]}.safetensors" if method in WEIGHTS_OF else None
     return make_scorer(method, localization_map, weights=weights).score(poses)
 
@@ -59,7 +55,7 @@ MAPS = {
 
 
 @pytest.mark.parametrize("name", MAPS)
-def test_flat_and_tiny_maps_are_scored_by_every_method(name: str) -> None:
+def test_flat_and_tiny_maps_are_scored_by_every_method(name):
     landmarks = MAPS[name]
     poses = poses_looking_along(np.zeros((2, 3)), [(1.0, 0.0, 0.0), (-1.0, 0.0, 0.0)])
     known = poses_looking_along([(0.5, 0.5, 0.0)], FORWARD)
@@ -78,7 +74,7 @@ def test_flat_and_tiny_maps_are_scored_by_every_method(name: str) -> None:
     assert np.isfinite(MappedSpace(landmarks.points, [(0.5, 0.5, 0.0)]).bounds).all()
 
 
-def test_a_view_exactly_on_a_landmark() -> None:
+def test_a_view_exactly_on_a_landmark():
     landmarks = room_landmarks(200)
     here = landmarks.points[17]
     poses = poses_looking_along(np.tile(here, (len(DIRECTIONS), 1)), DIRECTIONS)
@@ -96,7 +92,7 @@ def test_a_view_exactly_on_a_landmark() -> None:
         HiddenPointRemoval().unoccluded(here[None], landmarks.points)
 
 
-def test_images_of_one_pixel() -> None:
+def test_images_of_one_pixel():
     camera = PinholeCamera(1, 1, 1.0)
     pose = poses_looking_along([(3.0, 2.5, 1.5)], FORWARD)
     images = [WarpRenderer(furnished_room(), method=method).render(camera, pose) for method in ("raster", "rays")]
@@ -112,7 +108,7 @@ def test_images_of_one_pixel() -> None:
         assert np.isfinite(scores_of(method, localization_map, pose)).all()
 
 
-def test_seventy_thousand_directions() -> None:
+def test_seventy_thousand_directions():
     axes = fibonacci_sphere(70_000)
     landmarks = room_landmarks(60)
     place = np.array([(3.0, 2.5, 1.5)])
@@ -140,12 +136,12 @@ HUGE = (100_000, 100_000, 100_000)
         lambda: VoxelGrid((0, 0, 0), (1, 1, 1), HUGE).centers(),
     ],
 )
-def test_requests_that_exceed_any_memory(refused: Callable[[], object]) -> None:
+def test_requests_that_exceed_any_memory(refused):
     with pytest.raises(ConfigError):
         refused()
 
 
-def test_requests_that_exceed_the_free_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_requests_that_exceed_the_free_memory(monkeypatch):
     landmarks = room_landmarks(60)
     rotations = rotation_looking_along(fibonacci_sphere(20_000))
     monkeypatch.setattr(memory, "available_bytes", lambda: 2_000_000)

@@ -1,7 +1,5 @@
 """Base commands use no package of an extra, and commands that need one name its extra."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 import tomllib
@@ -19,12 +17,12 @@ sys.exit(main(sys.argv[1:]))
 """
 
 
-def ran(*arguments: str) -> subprocess.CompletedProcess[str]:
+def ran(*arguments):
     """Run a command where no package of an extra can be imported."""
     return subprocess.run([sys.executable, "-c", BLOCKED, *arguments], capture_output=True, text=True)
 
 
-def test_every_extra_is_declared() -> None:
+def test_every_extra_is_declared():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     assert {*EXTRAS.values()} <= {*project["optional-dependencies"]}
     names = {"cv2": "opencv", "sklearn": "scikit-learn", "rerun": "rerun-sdk"}
@@ -34,7 +32,7 @@ def test_every_extra_is_declared() -> None:
         assert name not in base and any(name in one for one in project["optional-dependencies"][extra])
 
 
-def test_base_modules_import_no_extra() -> None:
+def test_base_modules_import_no_extra():
     modules = ("holdout.report", "view.server", "robot.export", "localization.localizer", "select.where_to_look")
     text = "import sys; from importlib import import_module; from wheretolook.utils.package import EXTRAS;"
     text += " sys.modules.update(dict.fromkeys(EXTRAS));"
@@ -42,7 +40,7 @@ def test_base_modules_import_no_extra() -> None:
     subprocess.run([sys.executable, "-c", text], check=True)
 
 
-def test_commands_that_need_an_extra_name_it(tmp_path: Path) -> None:
+def test_commands_that_need_an_extra_name_it(tmp_path):
     (tmp_path / "images").mkdir()
     for name in "ab":
         (tmp_path / "images" / f"{name}.png").touch()

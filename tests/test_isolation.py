@@ -1,7 +1,5 @@
 """The suite is apart from the checkout and its user, and fails if a test has changed the checkout."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess
@@ -13,7 +11,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 
 
-def test_home_and_working_folder_are_empty_and_inherited() -> None:
+def test_home_and_working_folder_are_empty_and_inherited():
     code = "import os; print(os.listdir(), os.listdir(os.path.expanduser('~')))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout == "[] []\n"
@@ -45,11 +43,8 @@ CHANGES = """
 CHANGED = "README.md, data/changed.txt, data/demo, data/removed.txt, views.csv"
 
 
-@pytest.mark.parametrize(
-    ("code", "changed", "options"),
-    [("", "", []), (CHANGES, CHANGED, []), (CHANGES, CHANGED, ["-p", "xdist", "-n", "1"])],
-)
-def test_a_changed_checkout_fails_the_suite(code: str, changed: str, options: list[str], tmp_path: Path) -> None:
+@pytest.mark.parametrize(("code", "changed", "options"), [("", "", []), (CHANGES, CHANGED, ["-p", "xdist", "-n", "1"])])
+def test_a_changed_checkout_fails_the_suite(code, changed, options, tmp_path):
     shutil.copy(ROOT / "conftest.py", tmp_path)
     for name in ("data", "tests"):
         (tmp_path / name).mkdir()

@@ -1,7 +1,5 @@
 """Notebooks carry the outputs of their scripts, small and without traces of a machine, and these are today's."""
 
-from __future__ import annotations
-
 import base64
 import io
 import os
@@ -14,7 +12,6 @@ import jupytext
 import nbformat
 import pytest
 from execute import WIDEST_PX, execute, main
-from nbformat import NotebookNode
 from PIL import Image
 
 from wheretolook_paper.release.notebook import open_store
@@ -27,16 +24,16 @@ MEASURED = ("09_your_own_map", "10_looks")
 by_name = pytest.mark.parametrize("script", SCRIPTS, ids=lambda script: script.stem)
 
 
-def outputs(notebook: NotebookNode) -> list[NotebookNode]:
+def outputs(notebook):
     return [output for cell in notebook.cells for output in cell.get("outputs", [])]
 
 
-def pictures(notebook: NotebookNode) -> list[Image.Image]:
+def pictures(notebook):
     found = [output.data["image/png"] for output in outputs(notebook) if "image/png" in output.get("data", {})]
     return [Image.open(io.BytesIO(base64.b64decode(content))) for content in found]
 
 
-def texts(notebook: NotebookNode) -> list[str]:
+def texts(notebook):
     """What the outputs say, without tags and styles of tables."""
     parts = [text for output in outputs(notebook) for text in (output.get("text"), *output.get("data", {}).values())
              if text is not None and "image/png" not in output.get("data", {})]  # fmt: skip
@@ -44,12 +41,12 @@ def texts(notebook: NotebookNode) -> list[str]:
     return [" ".join(unescape(part).split()) for part in plain]
 
 
-def numbers(text: str) -> list[float]:
+def numbers(text):
     return [float(number.replace(",", "")) for number in re.findall(r"-?\d[\d,]*\.?\d*", text)]
 
 
 @by_name
-def test_notebooks_have_outputs_and_the_text_of_their_scripts(script: Path) -> None:
+def test_notebooks_have_outputs_and_the_text_of_their_scripts(script):
     notebook = nbformat.read(script.with_suffix(".ipynb"), as_version=4)
     nbformat.validate(notebook)
     text = jupytext.read(script)
@@ -62,18 +59,18 @@ def test_notebooks_have_outputs_and_the_text_of_their_scripts(script: Path) -> N
 
 
 @by_name
-def test_notebooks_have_no_trace_of_a_machine(script: Path) -> None:
+def test_notebooks_have_no_trace_of_a_machine(script):
     content = script.with_suffix(".ipynb").read_text()
     assert re.findall(r"(?<![\w./])/(?:home|root|tmp|work|usr|var|Users|private)/[^\s\"]*", content) == []
     assert re.findall(r"[A-Z]:\\\\|\bat 0x[0-9a-f]+|iopub|widget-view", content) == []
 
 
-def test_notebooks_are_small_together() -> None:
+def test_notebooks_are_small_together():
     assert sum(path.stat().st_size for path in FOLDER.glob("*.ipynb")) < 6_000_000
 
 
 @pytest.fixture(scope="module")
-def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def store(tmp_path_factory):
     """Return a store of the release's runs."""
     folder = tmp_path_factory.mktemp("notebooks") / "mlruns"
     with pytest.MonkeyPatch.context() as patch:
@@ -85,7 +82,7 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.slow
 @by_name
-def test_outputs_are_those_of_todays_results(script: Path, store: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_outputs_are_those_of_todays_results(script, store, monkeypatch):
     monkeypatch.setenv("WHERETOLOOK_MLRUNS", str(store))
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(entry for entry in sys.path if entry))
     stored = nbformat.read(script.with_suffix(".ipynb"), as_version=4)
@@ -97,9 +94,7 @@ def test_outputs_are_those_of_todays_results(script: Path, store: Path, monkeypa
         assert new == pytest.approx(old, rel=0.05, abs=0.01), f"stale: make notebooks NOTEBOOKS={script.stem}"
 
 
-def test_execution_keeps_figures_and_text_and_names_what_fails(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_execution_keeps_figures_and_text_and_names_what_fails(tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(entry for entry in sys.path if entry))
     monkeypatch.setenv("WHERETOLOOK_MLRUNS", str(tmp_path))
     monkeypatch.setattr("execute.FOLDER", tmp_path)

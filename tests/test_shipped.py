@@ -1,7 +1,5 @@
 """What ships with the package is found under its name in any folder, and scores without being asked for."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from pathlib import Path
@@ -21,18 +19,13 @@ ROOT = Path(__file__).parents[1]
 
 
 @pytest.fixture
-def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def elsewhere(tmp_path, monkeypatch):
     """An empty folder that everything is started in."""
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
 
-@pytest.fixture
-def localization_map() -> LocalizationMap:
-    return LocalizationMap(Map(make_landmarks(np.random.default_rng(0), 200)), CAMERA)
-
-
-def test_what_ships_is_what_lies_in_the_project() -> None:
+def test_what_ships_is_what_lies_in_the_project():
     assert shipped_configs() == sorted(f"configs/{path.name}" for path in (ROOT / "configs").glob("*.yaml"))
     weights = [path.name for path in sorted((ROOT / WEIGHTS).glob("*.safetensors"))]
     assert "set.safetensors" in weights
@@ -42,7 +35,7 @@ def test_what_ships_is_what_lies_in_the_project() -> None:
         shipped("configs/none.yaml")
 
 
-def test_files_of_ones_own_come_first(elsewhere: Path) -> None:
+def test_files_of_ones_own_come_first(elsewhere):
     name = "configs/demo.yaml"
     assert or_shipped(name) == shipped(name)
     for path in ("configs/none.yaml", "../configs/demo.yaml", str(elsewhere / name)):
@@ -58,7 +51,8 @@ def test_files_of_ones_own_come_first(elsewhere: Path) -> None:
 
 
 @pytest.mark.usefixtures("elsewhere")
-def test_a_map_is_scored_by_the_weights_that_ship(localization_map: LocalizationMap) -> None:
+def test_a_map_is_scored_by_the_weights_that_ship():
+    localization_map = LocalizationMap(Map(make_landmarks(np.random.default_rng(0), 200)), CAMERA)
     rng = np.random.default_rng(1)
     views = poses_looking_along(rng.uniform((-1, -1, 1), (1, 1, 2), (20, 3)), rng.normal(size=(20, 3)))
     scorer = load_scorer(localization_map)
@@ -68,7 +62,7 @@ def test_a_map_is_scored_by_the_weights_that_ship(localization_map: Localization
         np.testing.assert_array_equal(same.score(views), expected)
 
 
-def test_public_names_are_there_and_cost_nothing_until_they_are_used() -> None:
+def test_public_names_are_there_and_cost_nothing_until_they_are_used():
     code = """import sys
 import wheretolook
 print(sorted(name for name in sys.modules if name.partition(".")[0] not in sys.stdlib_module_names))

@@ -1,7 +1,5 @@
 """A wheel, made of the source distribution and installed away from the checkout, is all that a user needs."""
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 import sys
@@ -44,7 +42,7 @@ print(scorer.name, there > 0.5 > away)
 """
 
 
-def ran(arguments: list[str], folder: Path, installed: Path | None = None) -> str:
+def ran(arguments, folder, installed=None):
     """What a Python process says that was started in a folder, with what is installed there before all else."""
     environment = {"PATH": "/usr/bin:/bin", "HOME": str(folder)} | ({"PYTHONPATH": str(installed)} if installed else {})
     done = subprocess.run([sys.executable, *arguments], capture_output=True, text=True, cwd=folder, env=environment)
@@ -53,7 +51,7 @@ def ran(arguments: list[str], folder: Path, installed: Path | None = None) -> st
 
 
 @pytest.fixture(scope="module")
-def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def wheel(tmp_path_factory):
     """Made without network: the checkout's files, of them the source distribution, and of that alone the wheel."""
     folder = tmp_path_factory.mktemp("wheel")
     checkout = folder / "checkout"
@@ -71,14 +69,14 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def installed(wheel: Path) -> Path:
+def installed(wheel):
     target = wheel.parent / "site"
     offline = ["--no-deps", "--no-index", "--disable-pip-version-check", "--quiet"]
     ran(["-m", "pip", "install", *offline, "--target", str(target), str(wheel)], wheel.parent)
     return target
 
 
-def test_it_carries_all_modules_and_what_they_need(wheel: Path) -> None:
+def test_it_carries_all_modules_and_what_they_need(wheel):
     assert wheel.name == f"wheretolook-{VERSION}-py3-none-any.whl"
     assert wheel.stat().st_size < 4e6
     with zipfile.ZipFile(wheel) as archive:
@@ -102,7 +100,7 @@ def test_it_carries_all_modules_and_what_they_need(wheel: Path) -> None:
     assert metadata["License-Expression"] == "Apache-2.0" and "wheretolook = wheretolook.cli:main" in points
 
 
-def test_commands_run_in_an_empty_folder(installed: Path, tmp_path: Path) -> None:
+def test_commands_run_in_an_empty_folder(installed, tmp_path):
     command = ["-c", "import sys; from wheretolook.cli import main; sys.exit(main(sys.argv[1:]))"]
     assert "\n  demo " in ran([*command, "--help"], tmp_path, installed)
     assert ran([*command, "--version"], tmp_path, installed).split() == ["wheretolook", VERSION]
@@ -114,6 +112,6 @@ def test_commands_run_in_an_empty_folder(installed: Path, tmp_path: Path) -> Non
     assert not [*tmp_path.iterdir()]
 
 
-def test_a_map_is_scored_by_the_weights_in_it(installed: Path, tmp_path: Path) -> None:
+def test_a_map_is_scored_by_the_weights_in_it(installed, tmp_path):
     said = ran(["-c", FIRST_SCORE, str(installed)], tmp_path, installed)
     assert said.split() == ["set", "True"]

@@ -10,17 +10,11 @@ a view that localizes) of the bundled scorer, of the scorer without the landmark
 bootstrap intervals over locations.
 """
 
-from __future__ import annotations
-
-import argparse
 import time
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
-from common import Scene, free_points, open_scene, use_one_thread
-from numpy.typing import NDArray
+from common import free_points, open_scene, options, use_one_thread
 from sklearn.metrics import roc_auc_score
 from tqdm.auto import tqdm
 
@@ -43,7 +37,7 @@ from wheretolook.visibility.occlusion import MeshOcclusion
 CAMERA = PinholeCamera()
 
 
-def random_views(scene: Scene, locations: int, directions: int, seed: int) -> NDArray[np.float64]:
+def random_views(scene, locations, directions, seed):
     """Return poses (locations x directions, 3, 4) at free locations 0.8 to 2 m high, with yaws all around."""
     rng = np.random.default_rng(seed)
     low, high = scene.mesh.bounds
@@ -55,11 +49,9 @@ def random_views(scene: Scene, locations: int, directions: int, seed: int) -> ND
     return poses_looking_along(np.repeat(positions, directions, axis=0), ahead.reshape(-1, 3))
 
 
-def keypoints_of(
-    poses: NDArray[np.float64], scene: Scene, extractor: KeypointExtractor, folder: Path, device: str
-) -> tuple[list[Keypoints], list[float]]:
+def keypoints_of(poses, scene, extractor, folder, device):
     """Return keypoints of views (B, 3, 4), cached in a folder, and the CPU seconds of each extraction."""
-    renderer: Any = None
+    renderer = None
     keypoints = []
     seconds = []
     for row, pose in enumerate(tqdm(poses, f"{extractor.config.method}: extract", unit="view")):
@@ -79,9 +71,7 @@ def keypoints_of(
     return keypoints, seconds
 
 
-def localize(
-    localizer: Localizer, keypoints: list[Keypoints], poses: NDArray[np.float64]
-) -> tuple[NDArray[np.bool_], float]:
+def localize(localizer, keypoints, poses):
     """Return which views localize within 5 cm and 0.4 degrees, (B,), and the milliseconds of matching per view."""
     good = []
     spent = 0.0
@@ -96,12 +86,12 @@ def localize(
     return np.array(good), 1000 * spent / len(keypoints)
 
 
-def numbers(scores: NDArray[Any], good: NDArray[np.bool_]) -> str:
+def numbers(scores, good):
     """Format AUC and regret of scores (L, D) of views that localize or not, with intervals over the L locations."""
     rng = np.random.default_rng(0)
     n = len(good)
 
-    def measure(rows: NDArray[np.int64]) -> tuple[float, float]:
+    def measure(rows):
         g = good[rows]
         possible = g.any(1)
         chosen = np.take_along_axis(g, scores[rows].argmax(1)[:, None], axis=1)[:, 0]
@@ -114,21 +104,14 @@ def numbers(scores: NDArray[Any], good: NDArray[np.bool_]) -> str:
     return f"{auc:.3f} ({low[0]:.3f} to {high[0]:.3f}) | {regret:.1f} ({low[1]:.1f} to {high[1]:.1f})"
 
 
-def main() -> None:
+def main():
     """Map, localize and score every scene by every extractor, and print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    add = parser.add_argument
-    add("--features", nargs="+", default=["opencv"], metavar="NAME[=WEIGHTS]", help="extractors (opencv)")
-    add("--scenes", nargs="+", type=int, default=[901], help="seeds of apartments")
-    add("--locations", type=int, default=60)
-    add("--directions", type=int, default=12)
-    add("--map-images", type=int, default=100)
-    add("--device", default="cpu")
-    add("--work", type=Path, required=True, metavar="FOLDER", help="cache of maps and keypoints")
-    args = parser.parse_args()
+    args = options(
+        __doc__, features=["opencv"], scenes=[901], locations=60, directions=12, map_images=100, device="cpu", work=...
+    )
     use_one_thread()
 
-    parts: dict[str, list[Any]] = {}
+    parts = {}
     for seed in args.scenes:
         folder = args.work / f"scene-{seed}"
         mesh = folder / "mesh.glb"

@@ -9,26 +9,23 @@ landmarks in 500 views at a location as if walls were transparent, and scoring 5
 default scorer, where landmarks of other rooms are occluded.
 """
 
-from __future__ import annotations
-
-import argparse
 import time
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
-from common import ROOM_M, room_map, use_one_thread
+from common import ROOM_M, options, room_map, seconds_of, show, use_one_thread, write_csv
 
 from wheretolook.features.extractor import quantize_descriptors
 from wheretolook.features.matches import match
 from wheretolook.features.matching import DescriptorIndex, DescriptorMatcher, has_index
+from wheretolook.figures.style import save_figure
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.lattices import fibonacci_sphere
-from wheretolook.geometry.poses import Float, rotation_looking_along
+from wheretolook.geometry.poses import rotation_looking_along
 from wheretolook.inputs.localization_map import LocalizationMap
-from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.mapping.map import Map
 from wheretolook.scorers.weights import load_scorer
 from wheretolook.utils.warp import start_warp
@@ -44,30 +41,19 @@ COUNTED = "count the landmarks of 500 views"
 SCORED = "score 500 views at each location"
 
 
-def seconds_of(work: Callable[[], object], repeats: int) -> list[float]:
-    """Return the CPU seconds of each repeat after one that is not counted."""
-    work()
-    times = []
-    for _ in range(repeats):
-        start = time.process_time()
-        work()
-        times.append(time.process_time() - start)
-    return times
-
-
-def room_offset(room: np.ndarray) -> Float:
+def room_offset(room):
     """Return the positions (N, 3) m of rooms by their numbers (N,), in rows of `ROOMS_IN_ROW`."""
     return np.column_stack([room % ROOMS_IN_ROW, room // ROOMS_IN_ROW, np.zeros(len(room))]) * PITCH_M
 
 
-def building(n: int) -> tuple[Landmarks, np.ndarray]:
+def building(n):
     """Return n landmarks in rooms, and the room (n,) of each."""
     landmarks = room_map(n, np.zeros((1, 3)), "cpu").landmarks
     room = np.arange(n) // IN_ROOM
     return replace(landmarks, points=landmarks.points + room_offset(room)), room
 
 
-def scoring(landmarks: Landmarks, room: np.ndarray, count: int) -> Callable[[], object]:
+def scoring(landmarks, room, count):
     """Return the work of scoring 500 views at each of `count` locations in random rooms."""
     rng = np.random.default_rng(1)
     chosen = rng.integers(0, room.max() + 1, count)
@@ -78,7 +64,7 @@ def scoring(landmarks: Landmarks, room: np.ndarray, count: int) -> Callable[[], 
     return lambda: scorer.score_directions(locations, axes)
 
 
-def matching(n: int) -> tuple[str, Callable[[], object]]:
+def matching(n):
     """Return what matches an image with n landmarks, exactly or by the index, and the work of one image."""
     rng = np.random.default_rng(0)
     stored = np.empty((n, 128), dtype=np.uint8)
@@ -91,56 +77,45 @@ def matching(n: int) -> tuple[str, Callable[[], object]]:
     return kind, lambda: match(matcher, [queries], 0.85, 16)
 
 
-def counting(landmarks: Landmarks, locations: Float, repeats: int) -> list[float]:
-    """Return the times of counting the landmarks in 500 views at a location, whatever occludes them."""
+def counting(landmarks):
+    """Return the work of counting the landmarks in 500 views at a location, whatever occludes them."""
     rotations = rotation_looking_along(fibonacci_sphere(500))
     points = DevicePoints(landmarks.points, "cpu")
-    options = SurveyOptions(keep=1, keep_occlusion=False)
-    return seconds_of(
-        lambda: survey(PinholeCamera(), rotations, locations[:1], points, NoOcclusion(), options), repeats
-    )
+    place = np.array([[0.0, 0.0, 1.3]])
+    chosen = SurveyOptions(keep=1, keep_occlusion=False)
+    return lambda: survey(PinholeCamera(), rotations, place, points, NoOcclusion(), chosen)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--landmarks", type=int, nargs="+", default=[2_500, 25_000, 250_000, 2_500_000])
-    parser.add_argument("--locations", type=int, nargs="+", default=[1, 10, 100, 1_000])
-    parser.add_argument("--repeats", type=int, default=5)
-    parser.add_argument("--out", type=Path, default=Path("scale.csv"))
-    parser.add_argument("--draw", type=Path, help="a table to draw instead of measuring")
-    parser.add_argument("--figure", type=Path, default=Path("scale.webp"))
-    args = parser.parse_args()
+def main():
+    args = options(
+        __doc__, landmarks=[2_500, 25_000, 250_000, 2_500_000], locations=[1, 10, 100, 1_000], repeats=5,
+        out=Path("scale.csv"), draw=Path, figure=Path("scale.webp"),
+    )  # fmt: skip
     if args.draw is not None:
         draw(pd.read_csv(args.draw), args.figure)
         return
     start_warp("cpu")
     use_one_thread()
-    rows: list[dict[str, object]] = []
+    rows = []
 
-    def add(what: str, size: int, times: list[float], about: str = "") -> None:
-        rows.append({"what": what, "size": size, "about": about, "median_s": np.median(times),
-                     "min_s": min(times), "max_s": max(times)})  # fmt: skip
-        print(
-            f"{what:34} {size:10,} {np.median(times):10.4f} s [{min(times):.4f}, {max(times):.4f}] {about}", flush=True
-        )
+    def add(what, size, work, repeats, about=""):
+        times = seconds_of(work, repeats, time.process_time)
+        rows.append({"what": what, "size": size, "about": about, **times})
+        show(f"{what}, {size:,}", times, about)
 
     for n in args.landmarks:
         landmarks, _ = building(n)
-        add(COUNTED, n, counting(landmarks, np.array([[0.0, 0.0, 1.3]]), args.repeats))
+        add(COUNTED, n, counting(landmarks), args.repeats)
         kind, work = matching(n)
-        add(MATCHED, n, seconds_of(work, args.repeats), kind)
+        add(MATCHED, n, work, args.repeats, kind)
     landmarks, room = building(10 * IN_ROOM)
     for count in args.locations:
-        add(SCORED, count, seconds_of(scoring(landmarks, room, count), max(1, args.repeats // 2)))
-    pd.DataFrame(rows).to_csv(args.out, index=False, float_format="%.6g", lineterminator="\n")
+        add(SCORED, count, scoring(landmarks, room, count), max(1, args.repeats // 2))
+    write_csv(pd.DataFrame(rows), args.out)
 
 
-def draw(table: pd.DataFrame, path: Path) -> None:
+def draw(table, path):
     """Draw times by the number of landmarks, and by the number of locations, on logarithmic axes."""
-    import matplotlib.pyplot as plt
-
-    from wheretolook.figures.style import save_figure
-
     figure, axes = plt.subplots(1, 2, figsize=(8, 3.2), layout="constrained")
     for axis, names, label in ((axes[0], (MATCHED, COUNTED), "landmarks"), (axes[1], (SCORED,), "locations")):
         for name in names:

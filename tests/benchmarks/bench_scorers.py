@@ -1,50 +1,37 @@
-"""Measure learned scorers: viewpoints per second from landmarks to scores, and the time of a single pose.
+"""Measure learned scorers: viewpoints per second from landmarks to scores, and the time of one inference step.
 
     python tests/benchmarks/bench_scorers.py [--device cuda] [--weights data/release/weights/set.safetensors ...]
     python tests/benchmarks/bench_scorers.py --step --out step.json
     python tests/benchmarks/bench_visibility.py --draw data/release/results/runtimes.csv step.json --figures FOLDER
 
 The map has 25,000 landmarks on the walls of a room; a random half is occluded from each location. A batch holds every
-direction at many locations. The time runs from poses and unoccluded landmarks to scores in host memory. Single poses
-are each at another location. Prints the median and the range over repeats.
+direction at many locations. The time runs from poses and unoccluded landmarks to scores in host memory.
 """
 
-from __future__ import annotations
-
-import argparse
 import itertools
 import json
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
-from bench_visibility import machine, seconds_of
-from common import ROOM_M, room_map, timed
+from bench_visibility import machine
+from common import ROOM_M, options, room_map, seconds_of, show, timed
 
 from wheretolook.geometry.lattices import fibonacci_sphere
 from wheretolook.geometry.poses import poses_looking_along
-from wheretolook.scorers.base import Scorer
 from wheretolook.scorers.registry import make_scorer
 from wheretolook.scorers.weights import load_scorer
 from wheretolook.utils.errors import WhereToLookError
+from wheretolook.utils.package import WEIGHTS, shipped
 
 
-def main() -> None:
+def main():
     """Parse the options, measure and print a table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--device", default="cpu")
-    parser.add_argument(
-        "--weights", type=Path, nargs="*", default=sorted(Path("data/release/weights").glob("*.safetensors"))
-    )
-    parser.add_argument("--landmarks", type=int, default=25_000)
-    parser.add_argument("--locations", type=int, default=200)
-    parser.add_argument("--directions", type=int, default=500)
-    parser.add_argument("--repeats", type=int, default=5)
-    parser.add_argument("--poses", type=int, default=200, help="single poses to time, or inference steps")
-    parser.add_argument("--step", action="store_true", help="measure one inference step")
-    parser.add_argument("--out", type=Path, help="write the inference steps to this JSON file")
-    args = parser.parse_args()
+    weights = sorted(shipped(WEIGHTS).glob("*.safetensors"))
+    args = options(
+        __doc__, device="cpu", weights=weights, landmarks=25_000, locations=200, directions=500, repeats=5, poses=200,
+        step=False, out=Path,
+    )  # fmt: skip
     rng = np.random.default_rng(1)
     low, high = np.array(ROOM_M)
     locations = rng.uniform(low + 0.5, high - 0.5, (args.locations, 3))
@@ -55,7 +42,7 @@ def main() -> None:
     cores = torch.get_num_threads()
     print(f"{len(views):,} views of {args.landmarks:,} landmarks, {np.median(seen):.0f} in view (up to {seen.max()})")
     print(f"on {args.device}, {cores} threads")
-    scorers: dict[str, Scorer] = {"bins": make_scorer("bins", localization_map)}
+    scorers = {"bins": make_scorer("bins", localization_map)}
     for path in args.weights:
         try:
             scorers[path.stem] = load_scorer(localization_map, path)
@@ -69,13 +56,9 @@ def main() -> None:
     for name, scorer in scorers.items():
         median = timed(f"{name}: all views", lambda s=scorer: s.score(views), args.repeats)
         print(f"{'':62} {len(views) / median:,.0f} views a second")
-        poses = iter(views[rng.permutation(len(views))[: args.poses + 1]])
-        timed(f"{name}: one pose", lambda s=scorer, p=poses: s.score(next(p)[None]), args.poses, 1e3, "ms")
 
 
-def inference_steps(
-    scorers: dict[str, Scorer], views: np.ndarray, landmarks: int, repeats: int
-) -> list[dict[str, Any]]:
+def inference_steps(scorers, views, landmarks, repeats):
     """Return rows of `runtimes.csv`: the time to score all directions of one location, and one pose.
 
     `views` (L, D, 3, 4) are poses by location; each repeat is at the next location.
@@ -88,8 +71,7 @@ def inference_steps(
             times = seconds_of(lambda s=scorer, p=steps: s.score(next(p)), times_each * repeats)
             size = {"locations": 1, "directions": directions, "landmarks": landmarks}
             rows.append({"what": f"{name}, {what}", "threads": torch.get_num_threads(), **size, **times})
-            low, median, high = (1e3 * times[key] for key in ("q1_s", "median_s", "q3_s"))
-            print(f"{name}, {what}".ljust(32), f"{median:9.3f} ms [{low:.3f}, {high:.3f}]", flush=True)
+            show(f"{name}, {what}", times)
     return rows
 
 

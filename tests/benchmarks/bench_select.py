@@ -1,12 +1,12 @@
 """Measure `wheretolook select` as a process, start-up and reading of the map included: wall and CPU time.
 
+With --cold each run compiles its kernels, as the first on a machine.
+
 python tests/benchmarks/bench_select.py --landmarks 25000 --waypoints 20 --repeats 5
 python tests/benchmarks/bench_select.py --landmarks 100000 --waypoints 1000 --cold
 """
 
-from __future__ import annotations
-
-import argparse
+import itertools
 import os
 import resource
 import subprocess
@@ -15,38 +15,31 @@ import tempfile
 import time
 from pathlib import Path
 
-import numpy as np
-from common import SIDE_M, write_model
+from common import options, seconds_of, show, write_model, write_waypoints
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--landmarks", type=int, default=25_000)
-    parser.add_argument("--waypoints", type=int, default=20)
-    parser.add_argument("--occlusion", default="none", choices=("none", "hidden-points"))
-    parser.add_argument("--device", default="cpu")
-    parser.add_argument("--cold", action="store_true", help="each run compiles its kernels, as the first on a machine")
-    parser.add_argument("--repeats", type=int, default=3)
-    options = parser.parse_args()
-    points = np.random.default_rng(1).uniform((1, 1, 1), (SIDE_M - 1, SIDE_M - 1, 2), (options.waypoints, 3))
-    wall: list[float] = []
-    cpu: list[float] = []
+def cpu_seconds():
+    """Return the CPU seconds of all processes that have ended."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
+
+
+def main():
+    args = options(__doc__, landmarks=25_000, waypoints=20, occlusion="none", device="cpu", cold=False, repeats=3)
     with tempfile.TemporaryDirectory() as folder:
-        write_model(Path(folder) / "sparse", options.landmarks)
-        np.savetxt(Path(folder) / "at.csv", points, delimiter=",", header="x,y,z", comments="")
+        write_model(Path(folder) / "sparse", args.landmarks)
+        write_waypoints(args.waypoints, Path(folder) / "at.csv")
         command = [sys.executable, "-m", "wheretolook", "select", "--map", "sparse", "--at", "at.csv"]
-        command += ["--out", "views.csv", "--device", options.device, "--occlusion", options.occlusion]
-        for run in range(options.repeats):
-            env = os.environ | ({"WARP_CACHE_PATH": f"{folder}/kernels-{run}"} if options.cold else {})
-            start = time.perf_counter()
-            before = resource.getrusage(resource.RUSAGE_CHILDREN)
-            subprocess.run(command, cwd=folder, check=True, env=env)
-            after = resource.getrusage(resource.RUSAGE_CHILDREN)
-            wall.append(time.perf_counter() - start)
-            cpu.append(after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime)
-    print(f"{options.waypoints:,} waypoints, 500 directions, {options.landmarks:,} landmarks, {options.repeats} runs")
-    for name, seconds in (("wall", wall), ("CPU", cpu)):
-        print(f"{name}: median {np.median(seconds):.3g} s ({min(seconds):.3g} to {max(seconds):.3g})")
+        command += ["--out", "views.csv", "--device", args.device, "--occlusion", args.occlusion]
+        runs = itertools.count()
+
+        def select():
+            cache = {"WARP_CACHE_PATH": f"{folder}/kernels-{next(runs)}"} if args.cold else {}
+            subprocess.run(command, cwd=folder, check=True, env=os.environ | cache)
+
+        print(f"{args.waypoints:,} waypoints, 500 directions, {args.landmarks:,} landmarks")
+        for name, clock in (("wall", time.perf_counter), ("CPU", cpu_seconds)):
+            show(name, seconds_of(select, args.repeats, clock))
 
 
 if __name__ == "__main__":

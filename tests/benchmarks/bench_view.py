@@ -9,9 +9,6 @@ not measured. Exits with code 1 if a client met an error.
     python tests/benchmarks/bench_view.py --landmarks 100000 --clients 20 --seconds 60
 """
 
-from __future__ import annotations
-
-import argparse
 import contextlib
 import logging
 import os
@@ -22,11 +19,10 @@ import tempfile
 import threading
 import time
 from pathlib import Path
-from typing import Any
 
 import msgspec
 import numpy as np
-from common import write_model
+from common import options, write_model
 
 from wheretolook.view.server import Viewer
 from wheretolook.view.state import ViewState
@@ -35,30 +31,30 @@ from wheretolook.view.viewed_map import open_map
 COMMAND = [sys.executable, "-c", "import sys; from wheretolook.cli import main; sys.exit(main(sys.argv[1:]))"]
 
 
-def message(kind: str, **fields: Any) -> bytes:
+def message(kind, **fields):
     """Encode a message as a browser sends it."""
     return bytes(msgspec.msgpack.encode({"type": kind, **fields}))
 
 
-def camera_message() -> bytes:
+def camera_message():
     """Encode the message with a browser's camera."""
     pose = {"wxyz": [1, 0, 0, 0], "position": [10, 10, 30], "look_at": [10, 10, 0], "up_direction": [0, 0, 1]}
     return message("ViewerCameraMessage", **pose, fov=1.0, near=0.1, far=99.0, image_height=600, image_width=800)
 
 
-def connected(port: int) -> Any:
+def connected(port):
     """Return a websocket connection to the viewer on a port."""
     import viser
     from websockets.sync.client import connect
 
-    protocol: Any = f"viser-v{viser.__version__}"
+    protocol = f"viser-v{viser.__version__}"
     return connect(f"ws://127.0.0.1:{port}", subprotocols=[protocol], max_size=None)
 
 
 class Client(threading.Thread):
     """A client that reads all messages for some seconds and clicks at random if asked to."""
 
-    def __init__(self, port: int, seconds: float, seed: int, clicks: bool = True) -> None:
+    def __init__(self, port, seconds, seed, clicks=True):
         super().__init__(daemon=True)
         self.port = port
         self.seconds = seconds
@@ -67,7 +63,7 @@ class Client(threading.Thread):
         self.error = ""
         self.clicks = clicks
 
-    def run(self) -> None:
+    def run(self):
         end = time.monotonic() + self.seconds
         try:
             with connected(self.port) as page:
@@ -89,15 +85,15 @@ class Client(threading.Thread):
 class ErrorCounter(logging.Handler):
     """Counts what the viewer and its libraries log as errors."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         super().__init__(logging.ERROR)
         self.n = 0
 
-    def emit(self, record: logging.LogRecord) -> None:
+    def emit(self, record):
         self.n += 1
 
 
-def print_opening(model: Path, repeat: int) -> None:
+def print_opening(model, repeat):
     """Print how long the command takes to open a model."""
     runs = [opening(model) for _ in range(repeat)]
     for row, what in enumerate(("landmarks on the page", "first coloured floor")):
@@ -108,7 +104,7 @@ def print_opening(model: Path, repeat: int) -> None:
         print(f"{what}: {', '.join(parts)}, {repeat} runs", flush=True)
 
 
-def opening(model: Path) -> list[tuple[float, float]]:
+def opening(model):
     """Return wall and CPU seconds from the start of the command to the landmarks and to the first coloured floor."""
     import zstandard
 
@@ -119,7 +115,7 @@ def opening(model: Path) -> list[tuple[float, float]]:
     command = [*COMMAND, "view", "--map", str(model), "--port", str(port)]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     try:
-        times: list[tuple[float, float]] = []
+        times = []
         client = None
         while client is None:
             assert process.poll() is None, "the command has ended"
@@ -140,18 +136,18 @@ def opening(model: Path) -> list[tuple[float, float]]:
         process.wait()
 
 
-def cpu_s(pid: int) -> float:
+def cpu_s(pid):
     """Return the CPU seconds of a process."""
     fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
-def memory_mb() -> float:
+def memory_mb():
     """Return the resident memory of this process."""
     return int(Path("/proc/self/statm").read_text().split()[1]) * 4096 / 2**20
 
 
-def print_turns(session: Any, n: int) -> None:
+def print_turns(session, n):
     """Print how long the score of a view turned by hand takes while the floor fills."""
     session.place.select(np.array([9.0, 9.0, 1.5]))
     while session.location is None:
@@ -170,7 +166,7 @@ def print_turns(session: Any, n: int) -> None:
     print(f"score of a view turned by hand: {median:.0f} ms ({low:.0f} to {high:.0f}), {n} turns", flush=True)
 
 
-def run_clients(viewer: Viewer, n: int, seconds: float) -> int:
+def run_clients(viewer, n, seconds):
     """Connect n clients at once, in two rounds; print traffic and memory, and return how many clients failed."""
     failed = 0
     for round_number in (1, 2):
@@ -188,33 +184,25 @@ def run_clients(viewer: Viewer, n: int, seconds: float) -> int:
     return failed
 
 
-def main() -> int:
+def main():
     """Parse the options, measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--map", type=Path, help="a COLMAP model instead")
-    parser.add_argument("--landmarks", type=int, default=100_000)
-    parser.add_argument("--clients", type=int, default=0)
-    parser.add_argument("--seconds", type=float, default=60.0)
-    parser.add_argument("--occlusion", default="")
-    parser.add_argument("--repeat", type=int, default=1, help="repeats of opening the map")
-    parser.add_argument("--turns", type=int, default=20)
-    options = parser.parse_args()
+    args = options(__doc__, map=Path, landmarks=100_000, clients=0, seconds=60.0, occlusion="", repeat=1, turns=20)
     errors = ErrorCounter()
     logging.getLogger().addHandler(errors)
     with tempfile.TemporaryDirectory() as folder:
-        model = options.map or Path(folder) / "sparse"
-        if options.map is None:
-            write_model(model, options.landmarks)
-        print_opening(model, options.repeat)
-        viewer = Viewer(open_map(model), port=0, state=ViewState(occlusion=options.occlusion))
+        model = args.map or Path(folder) / "sparse"
+        if args.map is None:
+            write_model(model, args.landmarks)
+        print_opening(model, args.repeat)
+        viewer = Viewer(open_map(model), port=0, state=ViewState(occlusion=args.occlusion))
         Client(viewer.port, 1e9, 0, clicks=False).start()
         while not viewer.sessions:
             time.sleep(0.01)
         session = next(iter(viewer.sessions.values()))
         while " locations" not in session.controls.status.content:
             time.sleep(0.05)
-        print_turns(session, options.turns)
-        failed = run_clients(viewer, options.clients, options.seconds) if options.clients else 0
+        print_turns(session, args.turns)
+        failed = run_clients(viewer, args.clients, args.seconds) if args.clients else 0
         viewer.stop()
     print(f"{failed} clients failed, {errors.n} errors logged")
     return int(failed + errors.n > 0)

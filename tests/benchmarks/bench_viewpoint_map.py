@@ -7,16 +7,13 @@ is `bins` unless weights are given. Queries are at random points in free voxels.
 repeats.
 """
 
-from __future__ import annotations
-
-import argparse
 import tempfile
 from dataclasses import replace
 from itertools import cycle
 from pathlib import Path
 
 import numpy as np
-from common import points_on_surface, room_map, timed
+from common import options, points_on_surface, room_map, timed
 
 from wheretolook.geometry.lattices import VoxelGrid, fibonacci_sphere
 from wheretolook.inputs.localization_map import LocalizationMap
@@ -35,7 +32,7 @@ from wheretolook.visibility.occlusion import MeshOcclusion
 from wheretolook_rooms.generator import generate_apartment
 
 
-def queries(viewpoint_map: ViewpointMap, n: int, repeats: int) -> None:
+def queries(viewpoint_map, n, repeats):
     """Time queries of single points and of a batch of n points."""
     rng = np.random.default_rng(0)
     grid = viewpoint_map.grid
@@ -46,47 +43,41 @@ def queries(viewpoint_map: ViewpointMap, n: int, repeats: int) -> None:
     axis = np.array([0.6, -0.8, 0.0])
 
     def each(query, points=arrays):
-        def work() -> None:
+        def work():
             for point in points:
                 query(point)
 
         return work
 
-    unit = 1e6 / len(arrays)
-    units = f"us for each of {len(arrays):,}"
-    timed("best, point an array", each(viewpoint_map.best), repeats, unit, units)
-    timed("best, point a tuple", each(viewpoint_map.best, tuples), repeats, unit, units)
-    timed("best 10", each(lambda p: viewpoint_map.best_n(p, 10)), repeats, unit, units)
-    timed("best in a cone of 30 degrees", each(lambda p: viewpoint_map.best_in_cone(p, axis, 30)), repeats, unit, units)
-    timed("best within a turn of 30 degrees", each(lambda p: viewpoint_map.best_reachable(p, axis, 30)), repeats, unit,
-          units)  # fmt: skip
-    timed("all directions, interpolated", each(viewpoint_map.interpolated), repeats, unit, units)
+    n = len(arrays)
+    for name, query in {
+        "best": viewpoint_map.best,
+        "best 10": lambda point: viewpoint_map.best_n(point, 10),
+        "best in a cone of 30 degrees": lambda point: viewpoint_map.best_in_cone(point, axis, 30),
+        "best within a turn of 30 degrees": lambda point: viewpoint_map.best_reachable(point, axis, 30),
+        "all directions, interpolated": viewpoint_map.interpolated,
+    }.items():
+        timed(name, each(query), repeats, n)
+    timed("best, point a tuple", each(viewpoint_map.best, tuples), repeats, n)
     median = timed(f"best, a batch of {len(points):,}", lambda: viewpoint_map.best_many(points), repeats)
     print(f"{'':62} {len(points) / median / 1e6:.1f} million points a second")
 
 
-def sequences(repeats: int, n: int, d: int) -> None:
+def sequences(repeats, n, d):
     """Time the choice of views along a path of n waypoints among d directions."""
     scores = np.random.default_rng(0).random((n, d))
     directions = fibonacci_sphere(d)
     limit = TurnLimit.of(directions)
-    timed(f"turn limit of {d} directions", lambda: TurnLimit.of(directions), repeats, 1e3, "ms")
-    timed(f"best sequence, {n} waypoints", lambda: best_sequence(scores, limit), repeats, 1e3, "ms")
+    timed(f"turn limit of {d} directions", lambda: TurnLimit.of(directions), repeats)
+    timed(f"best sequence, {n} waypoints", lambda: best_sequence(scores, limit), repeats)
 
 
-def main() -> None:
+def main():
     """Parse the options, measure and print a table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--device", default="cpu")
-    parser.add_argument("--weights", type=Path)
-    parser.add_argument("--landmarks", type=int, default=25_000)
-    parser.add_argument("--voxels", type=int, default=512)
-    parser.add_argument("--directions", type=int, default=500)
-    parser.add_argument("--repeats", type=int, default=7)
-    parser.add_argument("--builds", type=int, default=3)
-    parser.add_argument("--queries", type=int, default=1_000_000, help="points of a batch query")
-    parser.add_argument("--waypoints", type=int, default=200, help="of a path whose views are chosen")
-    args = parser.parse_args()
+    args = options(
+        __doc__, device="cpu", weights=Path, landmarks=25_000, voxels=512, directions=500, repeats=7, builds=3,
+        queries=1_000_000, waypoints=200,
+    )  # fmt: skip
     mesh = generate_apartment(ApartmentConfig(), 0, device=args.device)
     grid = VoxelGrid.over(mesh.bounds, (24, 24, 8))
     free_space = FreeSpace(mesh, device=args.device)
@@ -106,20 +97,20 @@ def main() -> None:
     viewpoint_map = build_viewpoint_map(scorer, grid, free, directions)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "map"
-        timed("save", lambda: viewpoint_map.save(path), args.repeats, 1e3, "ms")
+        timed("save", lambda: viewpoint_map.save(path), args.repeats)
         size = sum(file.stat().st_size for file in path.iterdir())
-        timed(f"load, {size / 1e6:.1f} MB", lambda: ViewpointMap.load(path), args.repeats, 1e3, "ms")
-        timed("load, memory-mapped", lambda: ViewpointMap.load(path, mmap=True), args.repeats, 1e3, "ms")
+        timed(f"load, {size / 1e6:.1f} MB", lambda: ViewpointMap.load(path), args.repeats)
+        timed("load, memory-mapped", lambda: ViewpointMap.load(path, mmap=True), args.repeats)
         queries(ViewpointMap.load(path, mmap=True), args.queries, args.repeats)
     sequences(args.repeats, args.waypoints, args.directions)
     best = directions[viewpoint_map.ranked[:, 0]]
     rows = cycle(range(len(best)))
 
-    def refine_one() -> None:
+    def refine_one():
         row = next(rows)
         refine_directions(scorer, viewpoint_map.locations[row], best[row])
 
-    timed("refine the best direction of one location", refine_one, 7 * args.repeats, 1e3, "ms")
+    timed("refine the best direction of one location", refine_one, 7 * args.repeats)
     some = slice(0, 64)
     found = refine_directions(scorer, viewpoint_map.locations[some], best[some])
     gain = found.scores - found.start_scores

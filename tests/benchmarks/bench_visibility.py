@@ -9,29 +9,24 @@ The size is the paper's (Sec. "Runtimes"): 648 locations, 24,919 landmarks and t
 configuration, in a synthetic apartment whose mesh is subdivided into at least 250,000 triangles.
 """
 
-from __future__ import annotations
-
-import argparse
 import contextlib
 import ctypes
 import gc
 import json
 import platform
 import resource
-import sys
 import threading
 import time
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
 import trimesh
 import warp as wp
-from common import free_points, points_on_surface
+from common import free_points, options, points_on_surface, seconds_of, show, write_csv
 
+from wheretolook.figures.style import save_figure
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.lattices import fibonacci_sphere
 from wheretolook.geometry.mesh import TexturedMesh
@@ -40,10 +35,13 @@ from wheretolook.rendering.raycasting import MeshRaycaster
 from wheretolook.scenes.config import ApartmentConfig
 from wheretolook.scenes.loading import load_mesh
 from wheretolook.space.free_space import FreeSpace
+from wheretolook.tracking.store import TrackingConfig
 from wheretolook.utils.processes import cores
 from wheretolook.utils.warp import start_warp
 from wheretolook.visibility.counting import FrustumCounter, SurveyOptions, survey
 from wheretolook.visibility.occlusion import DevicePoints, MeshOcclusion, NoOcclusion
+from wheretolook_paper.figures.runtimes import runtime_figure, scaling_figure
+from wheretolook_paper.release.runs import RUNTIMES_CSV, SCALING_CSV, log_runtimes
 from wheretolook_rooms.generator import generate_apartment
 
 CAMERA = PinholeCamera()
@@ -59,7 +57,7 @@ SCALING = {
 BASE = {"landmarks": 24_919, "locations": 64, "directions": 500}
 
 
-def subdivided(mesh: TexturedMesh, min_triangles: int) -> TexturedMesh:
+def subdivided(mesh, min_triangles):
     """Return an untextured copy of a mesh whose largest triangles are cut into four until there are `min_triangles`."""
     vertices = mesh.vertices.astype(np.float64)
     triangles = mesh.triangles
@@ -78,7 +76,7 @@ def subdivided(mesh: TexturedMesh, min_triangles: int) -> TexturedMesh:
 class Setup:
     """The mesh, landmarks, locations and occlusion of one run."""
 
-    def __init__(self, args: argparse.Namespace, device: str, n_landmarks: int, n_locations: int) -> None:
+    def __init__(self, args, device, n_landmarks, n_locations):
         self.rng = np.random.default_rng(0)
         base = load_mesh(args.scene) if args.scene else generate_apartment(ApartmentConfig(), 0, device=device)
         self.mesh = subdivided(base, args.triangles)
@@ -94,11 +92,11 @@ class Setup:
 class PeakMemory:
     """Measures the peak memory of a block: of the process, or of the device's pool."""
 
-    def __init__(self, device: str) -> None:
+    def __init__(self, device):
         self.device = device
         self.bytes = 0
 
-    def __enter__(self) -> PeakMemory:
+    def __enter__(self):
         gc.collect()
         with contextlib.suppress(OSError, AttributeError):
             ctypes.CDLL("libc.so.6").malloc_trim(0)  # otherwise reuse of freed memory would not be measured
@@ -108,34 +106,21 @@ class PeakMemory:
         self._thread.start()
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, *_):
         self._done.set()
         self._thread.join()
 
-    def _watch(self) -> None:
+    def _watch(self):
         while not self._done.wait(0.0005):
             self.bytes = max(self.bytes, self._now() - self._before)
 
-    def _now(self) -> int:
+    def _now(self):
         if wp.get_device(self.device).is_cuda:
             return int(wp.get_mempool_used_mem_current(self.device))
         return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
 
 
-def seconds_of(work: Callable[[], object], repeats: int) -> dict[str, float]:
-    """Return median, quartiles, minimum and maximum seconds over repeats, after one warm-up run."""
-    work()
-    seconds = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        work()
-        seconds.append(time.perf_counter() - start)
-    low, median, high = np.percentile(seconds, (25, 50, 75)).tolist()
-    ends = {"min_s": min(seconds), "max_s": max(seconds)}
-    return {"median_s": median, "q1_s": low, "q3_s": high, **ends, "repeats": repeats}
-
-
-def machine(device: str) -> dict[str, Any]:
+def machine(device):
     """Return the name of the device and of the host's processor, and the number of usable cores."""
     host = platform.machine()
     with contextlib.suppress(OSError):
@@ -146,7 +131,7 @@ def machine(device: str) -> dict[str, Any]:
     return {"device": device, "name": name, "host": host, "cores": cores(), **versions}
 
 
-def paper_size(args: argparse.Namespace, device: str) -> list[dict[str, Any]]:
+def paper_size(args, device):
     """Time every kind of work at the paper's size, print the times, and return a row for each."""
     setup = Setup(args, device, args.landmarks, args.locations)
     rotations = rotation_looking_along(fibonacci_sphere(args.directions))
@@ -156,16 +141,15 @@ def paper_size(args: argparse.Namespace, device: str) -> list[dict[str, Any]]:
     size["triangles"] = len(setup.mesh.triangles)
     n = args.locations * args.directions * args.landmarks
     print(f"{size}: {n / 1e9:.2f} G projections; {machine(device)}")
-    rows: list[dict[str, Any]] = []
+    rows = []
 
-    def add(what: str, threads: int, work: Callable[[], object], repeats: int = args.repeats, scale: float = 1) -> None:
+    def add(what, threads, work, repeats=args.repeats, scale=1):
         times = seconds_of(work, repeats)
         times |= {name: scale * value for name, value in times.items() if name != "repeats"}
         row = {"what": what, "threads": threads, **size, **times, "scale": scale}
         row["projections_per_s"] = n / row["median_s"]
         rows.append(row)
-        print(f"{what:32} {threads:3} thread(s): {1e3 * row['median_s']:12,.2f} ms  ({1e3 * row['min_s']:,.2f} to "
-              f"{1e3 * row['max_s']:,.2f}), {row['projections_per_s'] / 1e9:10,.2f} G/s")  # fmt: skip
+        show(f"{what}, {threads} thread(s)", times, f"{row['projections_per_s'] / 1e9:.2f} G/s")
 
     shared = (CAMERA, rotations, setup.locations, landmarks)
     counts_only = {"keep": 1, "keep_occlusion": False}
@@ -174,7 +158,7 @@ def paper_size(args: argparse.Namespace, device: str) -> list[dict[str, Any]]:
         add(COUNTS, threads, partial(survey, *shared, NoOcclusion(), SurveyOptions(threads=threads, **counts_only)))
     if setup.on_gpu:
 
-        def cast() -> Any:
+        def cast():
             mask = setup.occlusion.unoccluded_on_device(setup.locations, landmarks)
             wp.synchronize_device(device)
             return mask
@@ -184,7 +168,6 @@ def paper_size(args: argparse.Namespace, device: str) -> list[dict[str, Any]]:
     add("cells of the sphere (once)", 1, lambda: FrustumCounter(CAMERA, rotations, len(setup.points), device))
     some = setup.locations[setup.rng.choice(len(setup.locations), args.twin_locations, replace=False)]
     everything = np.ones((len(some), len(setup.points)), dtype=bool)
-    sys.path.append(str(Path(__file__).parents[1]))
     from twins.visibility import count_plain
 
     twin = partial(count_plain, CAMERA, rotations, some, setup.points, everything)
@@ -197,7 +180,7 @@ def paper_size(args: argparse.Namespace, device: str) -> list[dict[str, Any]]:
     return rows
 
 
-def scaling(args: argparse.Namespace, device: str) -> list[dict[str, Any]]:
+def scaling(args, device):
     """Measure how time and memory grow along each axis of `SCALING`, up to `--scaling-limit` of each."""
     axes = {axis: [value for value in values if value <= args.scaling_limit] for axis, values in SCALING.items()}
     base = {axis: min(value, max(axes[axis])) for axis, value in BASE.items()}
@@ -225,7 +208,7 @@ def scaling(args: argparse.Namespace, device: str) -> list[dict[str, Any]]:
     return rows
 
 
-def bounded(args: argparse.Namespace, device: str) -> list[dict[str, Any]]:
+def bounded(args, device):
     """Run 2 million landmarks x 5,000 locations within a memory bound; return its time and peak memory."""
     setup = Setup(args, device, 2_000_000, 5_000)
     rotations = rotation_looking_along(fibonacci_sphere(args.directions))
@@ -246,13 +229,8 @@ def bounded(args: argparse.Namespace, device: str) -> list[dict[str, Any]]:
     return [row]
 
 
-def draw(args: argparse.Namespace) -> None:
+def draw(args):
     """Write tables and figures of earlier results, and log them to MLflow if asked to."""
-    from wheretolook.figures.style import save_figure
-    from wheretolook.tracking.store import TrackingConfig
-    from wheretolook_paper.figures.runtimes import runtime_figure, scaling_figure
-    from wheretolook_paper.release.runs import RUNTIMES_CSV, SCALING_CSV, log_runtimes
-
     tables = [pd.read_csv(file) for file in args.draw if file.endswith(".csv")]
     results = [json.loads(Path(file).read_text()) for file in args.draw if not file.endswith(".csv")]
     sizes, growth = (
@@ -261,50 +239,35 @@ def draw(args: argparse.Namespace) -> None:
     )
     about = ["what", "threads", "name"]
     sizes = pd.concat([*tables, sizes], ignore_index=True).drop_duplicates(about, keep="last", ignore_index=True)
-    folder = Path(args.figures)
+    folder = args.figures
     folder.mkdir(parents=True, exist_ok=True)
     save_figure(runtime_figure(sizes), folder / "runtimes.png")
-    sizes.to_csv(folder / RUNTIMES_CSV, index=False, float_format="%.6g", lineterminator="\n")
+    write_csv(sizes, folder / RUNTIMES_CSV)
     if len(growth):
         save_figure(scaling_figure(growth), folder / "visibility-scaling.png")
-        growth.to_csv(folder / SCALING_CSV, index=False, float_format="%.6g", lineterminator="\n")
+        write_csv(growth, folder / SCALING_CSV)
     if args.log:
         log_runtimes(TrackingConfig(), folder)
 
 
-def main() -> None:
+def main():
     """Parse the options and measure, or draw earlier results."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--scene", help="mesh file; default: a synthetic apartment")
-    parser.add_argument("--device", default="cpu", help="Warp's device")
-    parser.add_argument("--locations", type=int, default=648)
-    parser.add_argument("--directions", type=int, default=500)
-    parser.add_argument("--landmarks", type=int, default=24_919)
-    parser.add_argument("--triangles", type=int, default=250_000, help="minimum number of triangles")
-    parser.add_argument("--repeats", type=int, default=20)
-    parser.add_argument("--twin-locations", type=int, default=2, help="locations of the twin, whose time is scaled up")
-    parser.add_argument("--twin-repeats", type=int, default=20)
-    parser.add_argument("--scaling", action="store_true", help="also measure how time and memory grow")
-    parser.add_argument("--scaling-limit", type=int, default=2_000_000, help="largest size along each axis")
-    parser.add_argument("--scaling-repeats", type=int, default=5)
-    parser.add_argument("--bounded", action="store_true", help="also run 2 million landmarks x 5,000 locations")
-    parser.add_argument("--memory-gb", type=float, default=2.0, help="memory bound of the blocks in work")
-    parser.add_argument("--out", help="write the results to this JSON file")
-    parser.add_argument("--draw", nargs="+", metavar="FILE", help="draw earlier results: JSON files, and runtimes.csv")
-    parser.add_argument("--figures", default=".", help="folder for figures and tables")
-    parser.add_argument("--log", action="store_true", help="log tables and figures to MLflow")
-    args = parser.parse_args()
-    if args.draw:
+    args = options(
+        __doc__, scene=str, device="cpu", locations=648, directions=500, landmarks=24_919, triangles=250_000,
+        repeats=20, twin_locations=2, twin_repeats=20, scaling=False, scaling_limit=2_000_000, scaling_repeats=5,
+        bounded=False, memory_gb=2.0, out=Path, draw=[""], figures=Path("."), log=False,
+    )  # fmt: skip
+    if any(args.draw):
         draw(args)
         return
     device = start_warp(args.device)
-    result: dict[str, Any] = {"machine": machine(device), "paper_size": paper_size(args, device)}
+    result = {"machine": machine(device), "paper_size": paper_size(args, device)}
     if args.scaling:
         result["scaling"] = scaling(args, device)
     if args.bounded:
         result["bounded"] = bounded(args, device)
     if args.out:
-        Path(args.out).write_text(json.dumps(result, indent=1))
+        args.out.write_text(json.dumps(result, indent=1))
 
 
 if __name__ == "__main__":

@@ -1,17 +1,20 @@
-"""Helpers that several benchmarks share: timing, rooms of random landmarks, generated scenes, COLMAP models."""
+"""The frame that benchmarks share: options, timing, tables; rooms of random landmarks, generated scenes, COLMAP models."""
 
 from __future__ import annotations
 
+import argparse
+import sys
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
+import torch
 
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.mesh import TexturedMesh
-from wheretolook.geometry.poses import Float, poses_looking_along
+from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.mapping.map import Map
@@ -21,25 +24,62 @@ from wheretolook.space.free_space import FreeSpace
 from wheretolook.visibility.occlusion import StoredOcclusion
 from wheretolook_rooms.generator import generate_apartment
 
+sys.path.append(str(Path(__file__).parents[1]))
+
 ROOM_M = ((-5.0, -4.0, 0.0), (5.0, 4.0, 2.6))
 SIDE_M = 20.0  # of the building of `write_model`
 HEIGHT_M = 3.0
 
 
-def timed(label: str, work: Callable[[], object], repeats: int, unit: float = 1.0, units: str = "s") -> float:
-    """Print the median and the range over repeats after one warm-up run; return the median in seconds."""
+def options(about, **defaults):
+    """Parse the command line: `...` is a required path, a type an optional value, a list several values, False a flag."""
+    parser = argparse.ArgumentParser(description=about, formatter_class=argparse.RawDescriptionHelpFormatter)
+    for name, default in defaults.items():
+        option = "--" + name.replace("_", "-")
+        if default is False:
+            parser.add_argument(option, action="store_true")
+        elif default is ...:
+            parser.add_argument(option, type=Path, required=True)
+        elif isinstance(default, type):
+            parser.add_argument(option, type=default)
+        elif isinstance(default, list):
+            parser.add_argument(option, nargs="*", type=type(default[0]), default=default)
+        else:
+            parser.add_argument(option, type=type(default), default=default)
+    return parser.parse_args()
+
+
+def seconds_of(work, repeats, clock=time.perf_counter):
+    """Return median, quartiles, minimum and maximum seconds over repeats, after one warm-up run."""
     work()
-    times = []
+    seconds = []
     for _ in range(repeats):
-        start = time.perf_counter()
+        start = clock()
         work()
-        times.append(time.perf_counter() - start)
-    median = float(np.median(times))
-    print(f"{label:62} {median * unit:9.3f} {units} [{min(times) * unit:.3f}, {max(times) * unit:.3f}]", flush=True)
-    return median
+        seconds.append(clock() - start)
+    low, first, median, third, high = np.percentile(seconds, (0, 25, 50, 75, 100)).tolist()
+    return {"median_s": median, "q1_s": first, "q3_s": third, "min_s": low, "max_s": high, "repeats": repeats}
 
 
-def room_landmarks(n: int, seed: int = 0) -> Float:
+def show(label, times, about=""):
+    """Print median, quartiles and range of `seconds_of` in milliseconds."""
+    median, first, third, low, high = (1e3 * times[f"{name}_s"] for name in ("median", "q1", "q3", "min", "max"))
+    print(f"{label:62} {median:12,.3f} ms, quartiles [{first:,.3f}, {third:,.3f}], range [{low:,.3f}, {high:,.3f}] {about}",
+          flush=True)  # fmt: skip
+
+
+def timed(label, work, repeats, each=1, clock=time.perf_counter):
+    """Print the times of one of `each` pieces of work; return their median in seconds."""
+    times = {name: value / each for name, value in seconds_of(work, repeats, clock).items()}
+    show(label, times)
+    return times["median_s"]
+
+
+def write_csv(table, path):
+    table.to_csv(path, index=False, float_format="%.6g", lineterminator="\n")
+
+
+def room_landmarks(n, seed=0):
     """Return points (n, 3) m on the walls, floor and ceiling of one room."""
     rng = np.random.default_rng(seed)
     points = rng.uniform(*ROOM_M, (n, 3))
@@ -48,14 +88,14 @@ def room_landmarks(n: int, seed: int = 0) -> Float:
     return points
 
 
-def room_map(n_landmarks: int, locations: Float, device: str) -> LocalizationMap:
+def room_map(n_landmarks, locations, device):
     """Return a map of room landmarks with random attributes; half of them are occluded from each location (L, 3) m."""
     rng = np.random.default_rng(0)
     points = room_landmarks(n_landmarks)
     offsets = points - np.mean(ROOM_M, axis=0)
     distance = np.linalg.norm(offsets, axis=1)
 
-    def uniform(low: float, high: float) -> np.ndarray:
+    def uniform(low, high):
         return rng.uniform(low, high, n_landmarks).astype(np.float32)
 
     landmarks = Landmarks(
@@ -75,7 +115,7 @@ def room_map(n_landmarks: int, locations: Float, device: str) -> LocalizationMap
     return LocalizationMap(Map(landmarks), PinholeCamera(), occlusion, device)
 
 
-def points_on_surface(mesh: TexturedMesh, n: int, rng: np.random.Generator) -> Float:
+def points_on_surface(mesh, n, rng):
     """Return points (n, 3) m spread over a mesh by area, with 5 mm noise."""
     a, b, c = np.moveaxis(mesh.vertices[mesh.triangles].astype(np.float64), 1, 0)
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
@@ -85,7 +125,7 @@ def points_on_surface(mesh: TexturedMesh, n: int, rng: np.random.Generator) -> F
     return on_triangle + rng.normal(scale=0.005, size=(n, 3))
 
 
-def free_points(space: FreeSpace, bounds: Float, n: int, rng: np.random.Generator) -> Float:
+def free_points(space, bounds, n, rng):
     """Return n points (n, 3) m drawn uniformly from free space within bounds (2, 3) m."""
     found = np.empty((0, 3))
     while len(found) < n:
@@ -103,7 +143,7 @@ class Scene:
     free_space: FreeSpace
 
 
-def open_scene(source: Path | None, folder: Path, seed: int, device: str) -> Scene:
+def open_scene(source, folder, seed, device):
     """Read a mesh file, or `mesh.glb` of a folder; without a source, generate an apartment into `folder`."""
     if source is None:
         source = folder / "mesh.glb"
@@ -114,41 +154,32 @@ def open_scene(source: Path | None, folder: Path, seed: int, device: str) -> Sce
     return Scene(source, mesh, FreeSpace(mesh, device=device))
 
 
-def write_model(folder: Path, n: int) -> None:
+def write_model(folder, n):
     """Write a COLMAP model of n landmarks on the walls of a building of rooms, seen by 200 images of a pinhole."""
-    import pycolmap
+    from colmap_models import colmap_model
 
     rng = np.random.default_rng(0)
     points = rng.uniform((0, 0, 0), (SIDE_M, SIDE_M, HEIGHT_M), (n, 3))
     points[np.arange(n), rng.integers(0, 2, n)] = 5.0 * rng.integers(0, 5, n)
-    model = pycolmap.Reconstruction()
-    camera = pycolmap.Camera(model="PINHOLE", width=640, height=480, params=[320, 320, 320, 240], camera_id=1)
-    model.add_camera_with_trivial_rig(camera)
     centers = rng.uniform((1, 1, 1), (SIDE_M - 1, SIDE_M - 1, 2), (200, 3))
     poses = poses_looking_along(centers, rng.normal(size=(200, 3)) * (1, 1, 0.2))
+    seen = np.zeros((200, n), dtype=bool)
     nearest = np.argsort(np.linalg.norm(points[:, None] - centers[None], axis=2), axis=1)
-    tracks = [pycolmap.Track() for _ in points]
-    n_observed = np.zeros(len(centers), dtype=int)
-    for track, images in zip(tracks, nearest[:, :4], strict=True):
-        for image in np.sort(images):
-            track.add_element(int(image) + 1, int(n_observed[image]))
-            n_observed[image] += 1
-    for number, pose in enumerate(poses):
-        keypoints = np.full((n_observed[number], 2), 100.0)
-        image = pycolmap.Image(name=f"{number:04}.jpg", keypoints=keypoints, camera_id=1, image_id=number + 1)
-        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pose))
-    for point, track in zip(points, tracks, strict=True):
-        model.add_point3D(point, track, np.zeros(3, dtype=np.uint8))
-    for point in model.points3D.values():
-        point.error = 0.4
+    seen[nearest[:, :4].T, np.arange(n)] = True
     folder.mkdir(parents=True, exist_ok=True)
-    model.write(str(folder))
+    colmap_model(points, poses, seen, (PinholeCamera(640, 480, 320.0),), False, 0.4).write(str(folder))
 
 
-def use_one_thread() -> None:
+def waypoints(n):
+    """Return n points (n, 3) m in the building of `write_model`."""
+    return np.random.default_rng(1).uniform((1, 1, 1), (SIDE_M - 1, SIDE_M - 1, 2), (n, 3))
+
+
+def write_waypoints(n, path):
+    np.savetxt(path, waypoints(n), delimiter=",", header="x,y,z", comments="")
+
+
+def use_one_thread():
     """Limit OpenCV and PyTorch to one thread, as in a labelling worker."""
-    import cv2
-    import torch
-
     cv2.setNumThreads(1)
     torch.set_num_threads(1)

@@ -1,7 +1,5 @@
 """Every benchmark runs once at small size."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil
@@ -19,7 +17,7 @@ WEIGHTS = ROOT / "data" / "release" / "weights" / "set.safetensors"
 pytestmark = pytest.mark.slow
 
 SMALL = {
-    "looks": f"{ROOT}/data/release/apartment-209 --directions 30 --places 2",
+    "looks": f"--scene {ROOT}/data/release/apartment-209 --directions 30 --places 2",
     "robot": f"--weights {WEIGHTS} --landmarks 500 --directions 20 --repeats 2",
     "scale": "--landmarks 500 5000 --locations 1 2 --repeats 1 --out /dev/null",
     "scorers": f"--weights {WEIGHTS} --landmarks 500 --locations 2 --directions 20 --repeats 1 --poses 2",
@@ -29,7 +27,7 @@ SMALL = {
 }
 
 
-def run(name: str, *arguments: str) -> str:
+def run(name, *arguments):
     """Run a benchmark; return what it prints."""
     command = [sys.executable, str(FOLDER / f"bench_{name}.py"), *arguments]
     done = subprocess.run(command, capture_output=True, text=True, env=os.environ | {"OMP_NUM_THREADS": "1"})
@@ -38,11 +36,11 @@ def run(name: str, *arguments: str) -> str:
 
 
 @pytest.mark.parametrize("name", SMALL)
-def test_small(name: str) -> None:
+def test_small(name):
     assert run(name, *SMALL[name].split())
 
 
-def test_visibility_is_measured_and_drawn(tmp_path: Path) -> None:
+def test_visibility_is_measured_and_drawn(tmp_path):
     out = tmp_path / "cpu.json"
     sizes = "--locations 4 --directions 20 --landmarks 300 --triangles 500 --repeats 1 --twin-repeats 1"
     scaling = "--scaling --scaling-limit 1000 --scaling-repeats 1"
@@ -61,15 +59,15 @@ def test_visibility_is_measured_and_drawn(tmp_path: Path) -> None:
     assert 0 < pose["q1_s"] <= pose["median_s"] <= pose["q3_s"] <= pose["max_s"]
 
 
-def test_features_and_labelling(tmp_path: Path) -> None:
+def test_features_and_labelling(tmp_path):
     sizes = ("--map-images", "12", "--locations", "2", "--directions", "2")
     assert "| opencv |" in run("features", "--work", str(tmp_path), *sizes)
     scene = tmp_path / "scene-901"
     shutil.copytree(scene / "opencv" / "map", scene / "map")
-    assert "ms per view" in run("labelling", str(scene), "--views", "8", "--batches", "4")
+    assert "ms per view" in run("labelling", "--scene", str(scene), "--views", "8", "--batches", "4")
 
 
-def test_the_ledger_compares_with_the_last_entry(tmp_path: Path) -> None:
+def test_the_ledger_compares_with_the_last_entry(tmp_path):
     sizes = "--locations 2 --landmarks 300 --triangles 500 --repeats 1"
     ledger = tmp_path / "ledger.csv"
     assert "first entry" in run("ledger", *sizes.split(), "--ledger", str(ledger), "--record")
@@ -77,6 +75,6 @@ def test_the_ledger_compares_with_the_last_entry(tmp_path: Path) -> None:
     assert len(ledger.read_text().splitlines()) == 8
 
 
-def test_every_benchmark_is_run() -> None:
+def test_every_benchmark_is_run():
     names = {path.stem.removeprefix("bench_") for path in FOLDER.glob("bench_*.py")}
     assert names == {*SMALL, "features", "labelling", "ledger", "visibility"}

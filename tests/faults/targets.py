@@ -42,8 +42,8 @@ class Target:
     read: Callable[[Path], object]
 
 
-def _model(text: bool) -> Callable[[Path], None]:
-    def make(folder: Path) -> None:
+def _model(text):
+    def make(folder):
         written(rig_model(), folder / "rig", text)
         written(hand_written_model()[0], folder / "small", text)
         for name in ("rigs", "frames"):  # as before COLMAP 3.12
@@ -52,23 +52,23 @@ def _model(text: bool) -> Callable[[Path], None]:
     return make
 
 
-def _model_files(suffix: str) -> tuple[str, ...]:
+def _model_files(suffix):
     files = ("cameras", "images", "points3D", "rigs", "frames")
     return tuple(f"rig/{name}{suffix}" for name in files) + tuple(f"small/{name}{suffix}" for name in files[:3])
 
 
-def _read_model(path: Path) -> None:
+def _read_model(path):
     model = read_model(path.parent)
     assert np.isfinite(colmap_poses(path.parent, model)).all()
     assert np.isfinite(load_colmap_landmarks(path.parent, reconstruction=model).points).all()
 
 
-def _database(folder: Path) -> None:
+def _database(folder):
     model, keypoints = hand_written_model()
     write_database(folder / "a.db", model, keypoints, random_descriptors([len(points) for points in keypoints]))
 
 
-def _hdf5(folder: Path) -> None:
+def _hdf5(folder):
     import h5py
 
     _, keypoints = hand_written_model()
@@ -80,25 +80,25 @@ def _hdf5(folder: Path) -> None:
             group["descriptors"] = (descriptors[i] / 512).T.astype(np.float16)
 
 
-def _read_features(path: Path) -> None:
+def _read_features(path):
     model = hand_written_model()[0]
     read_descriptors(path, model, model_arrays(model))
 
 
-def _landmarks(folder: Path) -> None:
+def _landmarks(folder):
     landmarks = load_colmap_landmarks(written(hand_written_model()[0], folder / "model"))
     shutil.rmtree(folder / "model")
     landmarks.save(folder / "landmarks.npz")
     landmarks.save(folder / "compact.npz", compact=True)
 
 
-def _viewpoint_map(folder: Path) -> None:
+def _viewpoint_map(folder):
     from planning.rooms import build, room_landmarks
 
     build(room_landmarks(20), directions=direction_lattice(5)).save(folder / "room")
 
 
-def _read_viewpoint_map(path: Path) -> None:
+def _read_viewpoint_map(path):
     for mmap in (True, False):
         ViewpointMap.load(path.parent, mmap).best_many([[1.0, 1.0, 1.0], [2.0, 3.0, 1.5]])
 
@@ -107,7 +107,7 @@ _MAP_ARRAYS = ("row_of_voxel", "directions", "ranked", "scores", "landmark_ids")
 _MAP_FILES = ("room/viewpoint_map.json", *(f"room/{name}.npy" for name in _MAP_ARRAYS))
 
 
-def _tables(folder: Path) -> None:
+def _tables(folder):
     table = read_table(make_scene(folder / "scene", "train", 0, n_locations=2, n_directions=3, n_landmarks=10).table)
     write_table(table, folder / "a.parquet")
     write_table(table, folder / "compact.parquet", compact=True)
@@ -115,23 +115,23 @@ def _tables(folder: Path) -> None:
     write_table(table.assign(camera_id=1, matched_rows=rows, inlier_rows=rows), folder / "matches.parquet")
 
 
-def _weights(folder: Path) -> None:
+def _weights(folder):
     header = {"format_version": 1, "method": "set", "camera": None, "training": {"method": "set"}}
     tensors = {"a": torch.arange(3.0), "b": torch.zeros((2, 2), dtype=torch.float16)}
     save_file(tensors, folder / "a.safetensors", metadata={METADATA_KEY: json.dumps(header)})
 
 
-def _read_weights(path: Path) -> None:
+def _read_weights(path):
     read_weights(path)
     read_training(path)
 
 
-def _glb(folder: Path) -> None:
+def _glb(folder):
     quad = textured(random_texture(np.random.default_rng(0), 4, 6), baseColorFactor=[128, 255, 255, 255])
     quad.export(folder / "one.glb")
 
 
-def _ply(folder: Path) -> None:
+def _ply(folder):
     (folder / "colors.ply").write_text(
         ply("property uchar red\nproperty uchar green\nproperty uchar blue", ["1 2 3"] * 4)
     )
@@ -140,7 +140,7 @@ def _ply(folder: Path) -> None:
     box.export(folder / "binary.ply")
 
 
-def _obj(folder: Path) -> None:
+def _obj(folder):
     from PIL import Image
 
     (folder / "a.obj").write_text(OBJ)
@@ -148,17 +148,17 @@ def _obj(folder: Path) -> None:
     Image.fromarray(random_texture(np.random.default_rng(0), 4, 6)).save(folder / "my texture.png")
 
 
-def _settings(folder: Path) -> None:
+def _settings(folder):
     shutil.copyfile(CONFIGS / "demo.yaml", folder / "demo.yaml")
     (folder / "alias.yaml").write_text("name: &a b\nscenes: {train: 1, kinds: [hall]}\nmapping: {n_images: 5}\n")
 
 
-def _waypoints(folder: Path) -> None:
+def _waypoints(folder):
     (folder / "a.csv").write_text('id,x,y,z\n"a, b",1,2,1.5\nc,-0.5,2e0,1.5\n')
     (folder / "a.tum").write_text("# t x y z\n0.5 1 2 3 0 0 0 1\n1.5 1 2 3 0 0 0 1\n")
 
 
-def _cameras(folder: Path) -> None:
+def _cameras(folder):
     text = "# c\n1 PINHOLE 64 48 32 32 32 24\n2 OPENCV_FISHEYE 64 48 32 32 32 24 0 0 0 0\n"
     (folder / "cameras.txt").write_text(text)
 

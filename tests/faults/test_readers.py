@@ -3,8 +3,6 @@
 `python -m faults.test_readers 3600` fuzzes for an hour.
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 import random
@@ -34,7 +32,7 @@ WORDS = [
 ]  # fmt: skip
 
 
-def mutated(data: bytes, rng: random.Random) -> bytes:
+def mutated(data, rng):
     """The bytes with one to four changes: a byte, a word in place of others, a cut, a repetition."""
     for _ in range(rng.randint(1, 4)):
         at = rng.randrange(len(data) + 1)
@@ -51,7 +49,7 @@ def mutated(data: bytes, rng: random.Random) -> bytes:
     return data
 
 
-def fuzz(folder: Path, seconds: float, seed: int) -> None:
+def fuzz(folder, seconds, seed):
     """Damage the files of all targets in turn. What goes wrong ends the process."""
     warnings.simplefilter("ignore")
     signal.signal(signal.SIGPROF, signal.SIG_DFL)
@@ -82,7 +80,7 @@ def fuzz(folder: Path, seconds: float, seed: int) -> None:
 
 @pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="time and memory are limited as on Linux")
-def test_damaged_files_do_no_harm(tmp_path: Path) -> None:
+def test_damaged_files_do_no_harm(tmp_path):
     (tmp_path / "fuzz").mkdir()
     command = [sys.executable, "-m", "faults.test_readers", "20", str(tmp_path / "fuzz")]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
@@ -94,7 +92,7 @@ FOUND = Path(__file__).parent / "found"
 
 
 @pytest.mark.parametrize("name", sorted(path.name for path in FOUND.iterdir()))
-def test_files_that_once_did_harm_are_read_or_refused(name: str, tmp_path: Path) -> None:
+def test_files_that_once_did_harm_are_read_or_refused(name, tmp_path):
     """The first byte chooses the file that the rest replaces, where a target has several."""
     if name == "hdf5":
         pytest.importorskip("h5py")

@@ -1,9 +1,5 @@
 """Figure files: formats, notes in metadata, reproducible bytes."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import pytest
 
 from wheretolook.figures import KINDS
@@ -11,7 +7,7 @@ from wheretolook.figures.style import new_figure, save_figure
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_files_keep_a_note_and_are_reproducible(kind: str, tmp_path: Path) -> None:
+def test_files_keep_a_note_and_are_reproducible(kind, tmp_path):
     contents = []
     for name, note in (("one", "runs: 1a2b, 3c4d"), ("two", "runs: 1a2b, 3c4d"), ("three", "")):
         figure = new_figure(3, 2)

@@ -1,9 +1,6 @@
 """The comparison with hloc, from a mesh to the table; with hloc where it is installed."""
 
-from __future__ import annotations
-
 from importlib.util import find_spec
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,7 +13,7 @@ from wheretolook_paper.studies.compare_hloc import main, render_set, summarize
 
 
 @pytest.mark.slow
-def test_a_mesh_becomes_a_set_and_its_queries_localize(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_mesh_becomes_a_set_and_its_queries_localize(tmp_path, capsys):
     mesh = tmp_path / "room.glb"
     save_glb(furnished_room(), mesh)
     sizes = {"locations": 2, "images": 16, "work": tmp_path / "work"}
@@ -43,7 +40,7 @@ def test_a_mesh_becomes_a_set_and_its_queries_localize(tmp_path: Path, capsys: p
     assert np.array_equal(again["error_m"], table["error_m"], equal_nan=True)
 
 
-def test_neither_folder_nor_mesh_nor_scene(tmp_path: Path) -> None:
+def test_neither_folder_nor_mesh_nor_scene(tmp_path):
     for name in ("nowhere.glb", "castle-3", "building-x", "building"):
         with pytest.raises(ConfigError, match="no such set") as error:
             render_set(name, 1, 10, tmp_path)

@@ -1,12 +1,8 @@
 """The paper's tables hold its numbers and ours, and LaTeX can read them."""
 
-from __future__ import annotations
-
 import re
-from pathlib import Path
 
 import numpy as np
-import pandas as pd
 import pytest
 
 from synthetic_scores import KEYS, make_scores
@@ -34,11 +30,11 @@ HERE = {
 
 
 @pytest.fixture(scope="module")
-def scores() -> pd.DataFrame:
+def scores():
     return make_scores()
 
 
-def test_the_papers_numbers_are_those_printed(scores: pd.DataFrame) -> None:
+def test_the_papers_numbers_are_those_printed(scores):
     tables = {name: table.set_index("paper_row") for name, table in paper_tables(scores).items()}
     assert {name: len(table) for name, table in tables.items()} == {"vs_others": 14, "input_variants": 3}
     for (name, row), numbers in PRINTED.items():
@@ -48,7 +44,7 @@ def test_the_papers_numbers_are_those_printed(scores: pd.DataFrame) -> None:
     assert tables["vs_others"].notna().all(axis=1).sum() == 12
 
 
-def test_rows_hold_the_scores_of_their_methods(scores: pd.DataFrame) -> None:
+def test_rows_hold_the_scores_of_their_methods(scores):
     tables = paper_tables(scores)
     names = dict(zip(tables["vs_others"]["paper_row"], tables["vs_others"]["method"], strict=True))
     assert {row: names[row] for row in HERE} == HERE
@@ -64,7 +60,7 @@ def test_rows_hold_the_scores_of_their_methods(scores: pd.DataFrame) -> None:
 
 
 @pytest.mark.parametrize("name", PAPER)
-def test_latex_rows_have_every_column(scores: pd.DataFrame, tmp_path: Path, name: str) -> None:
+def test_latex_rows_have_every_column(scores, tmp_path, name):
     write_paper_tables(scores, tmp_path)
     text = (tmp_path / f"table_{name}.tex").read_text()
     body = text.split(r"\toprule")[1].split(r"\bottomrule")[0]

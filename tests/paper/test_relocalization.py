@@ -1,7 +1,5 @@
 """A simulated camera that turns until it is localized: the summary of its poses."""
 
-from __future__ import annotations
-
 import numpy as np
 import pandas as pd
 import pytest
@@ -10,7 +8,7 @@ from wheretolook_paper.evaluation.relocalization import summarize, summary_markd
 from wheretolook_paper.studies.fit_confidence import fit, is_within, predict
 
 
-def poses_of(policy: str, place: int, good: list[bool], confidence: list[float]) -> pd.DataFrame:
+def poses_of(policy, place, good, confidence):
     """A place's chosen poses after each view, and a rival of each."""
     errors = [0.01 if right else 3.0 for right in good]
     chosen = pd.DataFrame(
@@ -20,7 +18,7 @@ def poses_of(policy: str, place: int, good: list[bool], confidence: list[float])
     return both.assign(scene="a", location_id=place, policy=policy, status="localized", error_deg=0.1)
 
 
-def test_a_camera_stops_at_its_confidence_or_after_the_last_view() -> None:
+def test_a_camera_stops_at_its_confidence_or_after_the_last_view():
     table = pd.concat(
         [
             poses_of("gain", 0, [False, True, True], [0.1, 0.96, 0.5]),  # stops after two, right
@@ -42,7 +40,7 @@ def test_a_camera_stops_at_its_confidence_or_after_the_last_view() -> None:
     assert "| gain   | 4" in summary_markdown(summary.reset_index(), 0.95)
 
 
-def test_a_fit_recovers_the_distribution_of_errors() -> None:
+def test_a_fit_recovers_the_distribution_of_errors():
     rng = np.random.default_rng(0)
     n = 4000
     place = rng.random(n) < 0.6

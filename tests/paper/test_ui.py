@@ -1,13 +1,10 @@
 """`wheretolook ui`: links to comparisons, and MLflow's server without its assistant."""
 
-from __future__ import annotations
-
 import signal
 import socket
 import subprocess
 import sys
 from http.client import HTTPConnection
-from pathlib import Path
 
 import pytest
 
@@ -18,34 +15,31 @@ from wheretolook_paper.commands.ui import Ui, comparisons
 
 
 @pytest.fixture
-def tracking(tmp_path: Path) -> TrackingConfig:
+def tracking(tmp_path):
     return TrackingConfig(str(tmp_path / "mlruns"))
 
 
-def test_evaluations_are_compared_first(tracking: TrackingConfig) -> None:
-    stages = ("label", "paths", "evaluate")
-    ids = {stage: experiment_id(client(tracking), tracking, stage, "house") for stage in stages}
+def test_evaluations_are_compared_first(tracking):
+    with pytest.raises(MissingRunError):
+        comparisons(tracking, "")
+    assert not tracking.root.exists()
+    ids = {"label": experiment_id(client(tracking), tracking, "label", "house")}
+    assert [*comparisons(tracking, "http://server").values()] == ["http://server/#/experiments"]
+    for stage in ("paths", "evaluate"):
+        ids[stage] = experiment_id(client(tracking), tracking, stage, "house")
     links = comparisons(tracking, "http://server")
     assert list(links) == ["house: evaluation", "house: paths"]
     view = "workflowType=machine_learning&viewStateShareKey=methods"
     assert links["house: evaluation"] == f"http://server/#/experiments/{ids['evaluate']}/runs?{view}"
 
 
-def test_a_store_without_comparisons_is_opened(tracking: TrackingConfig) -> None:
-    experiment_id(client(tracking), tracking, "label", "house")
-    assert [*comparisons(tracking, "http://server").values()] == ["http://server/#/experiments"]
-
-
-def test_what_cannot_be_served(tracking: TrackingConfig) -> None:
+def test_a_port_in_use():
     with socket.create_server(("127.0.0.1", 0)) as taken, pytest.raises(InUseError):
         Ui(port=taken.getsockname()[1]).run()
-    with pytest.raises(MissingRunError):
-        comparisons(tracking, "")
-    assert not tracking.root.exists()
 
 
 @pytest.mark.slow
-def test_the_server_has_no_assistant_and_ends_when_interrupted(tracking: TrackingConfig) -> None:
+def test_the_server_has_no_assistant_and_ends_when_interrupted(tracking):
     experiment_id(client(tracking), tracking, "evaluate", "house")
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]

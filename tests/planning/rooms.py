@@ -1,11 +1,7 @@
 """Viewpoint maps of a room with a cabinet in it, which hides landmarks from some voxels."""
 
-from __future__ import annotations
-
-from collections.abc import Callable, Iterable
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
@@ -13,21 +9,18 @@ import numpy as np
 from box_scenes import ROOM, furnished_room
 from synthetic_dataset import make_landmarks
 from wheretolook.dataset.layout import Dataset, SceneFolder
-from wheretolook.geometry.camera import Camera, PinholeCamera
+from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.lattices import VoxelGrid, direction_lattice
-from wheretolook.geometry.poses import Float
 from wheretolook.inputs.localization_map import LocalizationMap
-from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.mapping.map import Map
 from wheretolook.planning.scene_map import build_viewpoint_map
-from wheretolook.planning.viewpoint_map import ViewpointMap
 from wheretolook.rendering.raycasting import MeshRaycaster
 from wheretolook.scenes.loading import save_glb
 from wheretolook.scorers.registry import make_scorer
 from wheretolook.space.free_space import FreeSpace
 from wheretolook.utils.errors import PlanningError
 from wheretolook.utils.files import write_json
-from wheretolook.visibility.occlusion import MeshOcclusion, OcclusionModel
+from wheretolook.visibility.occlusion import MeshOcclusion
 
 CAMERA = PinholeCamera(160, 120, 80.0)
 GRID = VoxelGrid((0.0, 0.0, 0.0), ROOM, (5, 4, 3))
@@ -37,7 +30,7 @@ DIRECTIONS = direction_lattice(60)
 T = TypeVar("T")
 
 
-def patiently(plan: Callable[[float], T], seconds: float = 0.6) -> T:
+def patiently(plan, seconds=0.6):
     """Plan in the time that an idle machine needs; on a busy one, retry with much more."""
     for times in (1, 8):
         try:
@@ -47,7 +40,7 @@ def patiently(plan: Callable[[float], T], seconds: float = 0.6) -> T:
     return plan(40 * seconds)
 
 
-def room_landmarks(n: int, seed: int = 0) -> Landmarks:
+def room_landmarks(n, seed=0):
     """Return landmarks on the room's walls with random attributes; the cabinet occludes some."""
     rng = np.random.default_rng(seed)
     landmarks = make_landmarks(rng, n)
@@ -58,29 +51,29 @@ def room_landmarks(n: int, seed: int = 0) -> Landmarks:
 
 
 @cache
-def occlusion() -> MeshOcclusion:
+def occlusion():
     """Return occlusion by the room's mesh."""
     return MeshOcclusion(MeshRaycaster(furnished_room(), "cpu"))
 
 
 @cache
-def free_voxels() -> tuple[int, ...]:
+def free_voxels():
     """Return ids of the voxels where a camera can be."""
     free = FreeSpace(furnished_room()).is_free(GRID.centers())
     return tuple(np.flatnonzero(free).tolist())
 
 
-def room_map(landmarks: Landmarks, model: OcclusionModel | None = None) -> LocalizationMap:
+def room_map(landmarks, model=None):
     """Return the localization map of the room."""
     return LocalizationMap(Map(landmarks), CAMERA, model or occlusion())
 
 
-def build(landmarks: Landmarks, method: str = "bins", directions: Float = DIRECTIONS) -> ViewpointMap:
+def build(landmarks, method="bins", directions=DIRECTIONS):
     """Return the viewpoint map of the room."""
     return build_viewpoint_map(make_scorer(method, room_map(landmarks)), GRID, free_voxels(), directions, "fibonacci")
 
 
-def write_room_dataset(folder: Path, landmarks: Landmarks, camera: Camera = CAMERA, names: Iterable[str] = "a") -> None:
+def write_room_dataset(folder, landmarks, camera=CAMERA, names="a"):
     """Write dataset `folder`/data/rooms of furnished rooms with landmarks, as the map command leaves it."""
     scenes = tuple(SceneFolder(folder / "data" / "rooms" / name, "test", camera) for name in names)
     for scene in scenes:

@@ -1,9 +1,6 @@
 """Filling voxels whose centre is occupied from the nearest reachable voxels."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,7 +14,7 @@ class BoundedRoom(Room):
     bounds = BOUNDS
 
 
-def known_west_and_east() -> tuple:
+def known_west_and_east():
     """Return voxel centres and a map that knows the outermost columns: scores are 0.25 in the west, 0.75 in the east."""
     whole = looking_north()
     centers = whole.grid.centers()
@@ -31,7 +28,7 @@ def known_west_and_east() -> tuple:
     )  # fmt: skip
 
 
-def test_views_are_not_copied_through_walls() -> None:
+def test_views_are_not_copied_through_walls():
     centers, own = known_west_and_east()
     filled = fill_partially_free_voxels(own, BoundedRoom())
     known = own.row_of_voxel >= 0
@@ -50,7 +47,7 @@ def test_views_are_not_copied_through_walls() -> None:
         assert (rows >= 0).all() and (filled.scores[rows] == score).all()
 
 
-def test_a_filled_map_is_derived(tmp_path: Path) -> None:
+def test_a_filled_map_is_derived(tmp_path):
     filled = fill_partially_free_voxels(known_west_and_east()[1], BoundedRoom())
     assert filled.origin.derived
     with pytest.raises(MapFormatError):

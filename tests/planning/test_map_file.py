@@ -1,12 +1,9 @@
 """Saved viewpoint maps: round trips, foreign readers, and what is damaged."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import subprocess
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,22 +15,22 @@ from wheretolook.utils.errors import MapFormatError
 
 
 @pytest.fixture(scope="module")
-def viewpoint_map() -> ViewpointMap:
+def viewpoint_map():
     return build(room_landmarks(200))
 
 
 @pytest.fixture
-def folder(viewpoint_map: ViewpointMap, tmp_path: Path) -> Path:
+def folder(viewpoint_map, tmp_path):
     viewpoint_map.save(tmp_path / "maps" / "room")
     return tmp_path / "maps" / "room"
 
 
-def content_of(folder: Path) -> dict[str, bytes]:
+def content_of(folder):
     return {path.name: path.read_bytes() for path in sorted(folder.iterdir())}
 
 
 @pytest.mark.parametrize("mmap", [False, True])
-def test_what_was_saved_comes_back(viewpoint_map: ViewpointMap, folder: Path, mmap: bool) -> None:
+def test_what_was_saved_comes_back(viewpoint_map, folder, mmap):
     loaded = ViewpointMap.load(folder, mmap)
     for name, (kind, _, _) in ARRAYS.items():
         np.testing.assert_array_equal(getattr(loaded, name), getattr(viewpoint_map, name))
@@ -44,7 +41,7 @@ def test_what_was_saved_comes_back(viewpoint_map: ViewpointMap, folder: Path, mm
     assert content_of(folder.with_name("again")) == content_of(folder)
 
 
-def test_a_map_can_replace_one_whose_files_are_mapped(folder: Path) -> None:
+def test_a_map_can_replace_one_whose_files_are_mapped(folder):
     new = build(room_landmarks(205))
     mapped = ViewpointMap.load(folder, mmap=True)
     before = mapped.n_visible.copy()
@@ -55,7 +52,7 @@ def test_a_map_can_replace_one_whose_files_are_mapped(folder: Path) -> None:
 
 
 @pytest.mark.skipif(shutil.which("g++") is None, reason="needs a C++ compiler")
-def test_the_layouts_example_compiles_and_agrees(viewpoint_map: ViewpointMap, folder: Path) -> None:
+def test_the_layouts_example_compiles_and_agrees(viewpoint_map, folder):
     text = (folder / LAYOUT).read_text().split("IN C++")[1].split("\n\n", 1)[1].split("\n\nLANDMARKS")[0]
     template, body = text.split("  int64_t voxel = 0;", 1)
     about = json.loads((folder / DESCRIPTION).read_text())
@@ -95,15 +92,11 @@ int main() {{
 @pytest.mark.parametrize(
     "change",
     [
-        {"version": 2},
-        {"format": "else"},
-        {"sizes": {"V": 60, "L": 1, "D": 60, "N": 200}},
-        {"sizes": {}},
-        {"grid": {"lower": [0, 0, 0], "upper": [1, 1, 1], "shape": [1, 1, 1]}},
-        {"origin": {"scorer": "bins"}},
+        {"version": 2}, {"format": "else"}, {"sizes": {"V": 60, "L": 1, "D": 60, "N": 200}}, {"sizes": {}},
+        {"grid": {"lower": [0, 0, 0], "upper": [1, 1, 1], "shape": [1, 1, 1]}}, {"origin": {"scorer": "bins"}},
     ],
-)
-def test_damaged_descriptions(folder: Path, change: dict[str, object]) -> None:
+)  # fmt: skip
+def test_damaged_descriptions(folder, change):
     path = folder / DESCRIPTION
     path.write_text(json.dumps({**json.loads(path.read_text()), **change}))
     for mmap in (False, True):
@@ -112,7 +105,7 @@ def test_damaged_descriptions(folder: Path, change: dict[str, object]) -> None:
 
 
 @pytest.mark.parametrize("name", ["row_of_voxel.npy", "scores.npy", DESCRIPTION])
-def test_damaged_files(folder: Path, name: str) -> None:
+def test_damaged_files(folder, name):
     content = (folder / name).read_bytes()
     flipped = content[:-10] + bytes([content[-10] ^ 0x80]) + content[-9:]
     for damaged in (flipped, content[: len(content) // 2], None):
@@ -123,7 +116,7 @@ def test_damaged_files(folder: Path, name: str) -> None:
             ViewpointMap.load(folder)
 
 
-def test_folders_with_other_files_are_not_replaced(viewpoint_map: ViewpointMap, folder: Path) -> None:
+def test_folders_with_other_files_are_not_replaced(viewpoint_map, folder):
     (folder / "notes.txt").write_text("mine")
     (folder.parent / "notes.txt").write_text("mine")
     for other in (folder, folder.parent):
@@ -132,7 +125,7 @@ def test_folders_with_other_files_are_not_replaced(viewpoint_map: ViewpointMap, 
         assert (other / "notes.txt").read_text() == "mine"
 
 
-def test_rows_must_be_used_once(viewpoint_map: ViewpointMap) -> None:
+def test_rows_must_be_used_once(viewpoint_map):
     rows = viewpoint_map.row_of_voxel.copy()
     first, second = viewpoint_map.voxel_of_row[:2]
     rows[[first, second]] = rows[[second, first]]
@@ -140,7 +133,7 @@ def test_rows_must_be_used_once(viewpoint_map: ViewpointMap) -> None:
         replace(viewpoint_map, row_of_voxel=rows)
 
 
-def test_derived_maps_are_not_saved(viewpoint_map: ViewpointMap, tmp_path: Path) -> None:
+def test_derived_maps_are_not_saved(viewpoint_map, tmp_path):
     with pytest.raises(MapFormatError):
         shares_below(viewpoint_map).save(tmp_path / "room")
     assert list(tmp_path.iterdir()) == []

@@ -1,7 +1,5 @@
 """Paths of a scene by the plan and viewpoint-map stages, seen by a pinhole and by a fisheye."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
@@ -13,12 +11,10 @@ import pytest
 from planning.rooms import occlusion, patiently, room_landmarks, write_room_dataset
 from wheretolook.cli import parse_command
 from wheretolook.dataset.viewpoint_table import poses
-from wheretolook.geometry.camera import Camera, ColmapCamera, PinholeCamera
+from wheretolook.geometry.camera import ColmapCamera, PinholeCamera
 from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.map import Map
-from wheretolook.planning.routes import PlannedPath
-from wheretolook.scorers.base import Scorer
 from wheretolook.scorers.registry import make_scorer
 
 LANDMARKS = room_landmarks(300)
@@ -30,12 +26,12 @@ GOAL = (2.8, 1.6, 1.4)
 
 
 @pytest.fixture(autouse=True)
-def untracked(monkeypatch: pytest.MonkeyPatch) -> None:
+def untracked(monkeypatch):
     """A new tracking store takes seconds to make."""
     monkeypatch.setattr(import_module("wheretolook.commands.plan"), "_log", lambda *given: None)
 
 
-def options(folder: Path, camera: Camera) -> list[str]:
+def options(folder, camera):
     """Write a dataset of one room; return the options that name it."""
     write_room_dataset(folder, LANDMARKS, camera)
     model = camera.colmap
@@ -44,7 +40,7 @@ def options(folder: Path, camera: Camera) -> list[str]:
     return ["--config", str(folder / "rooms.yaml"), "--data", str(folder / "data"), "--device", "cpu"]
 
 
-def planned(folder: Path, camera: Camera, method: str, film: str = "none") -> tuple[PlannedPath, pd.DataFrame, Scorer]:
+def planned(folder, camera, method, film="none"):
     """Plan a path through the room; return it, its table and its scorer."""
     ends = ["--start", str(list(START)), "--goal", str(list(GOAL)), "--out", str(folder / "way")]
     lattice = ["--plan.grid", "[3, 3, 2]", "--plan.directions", "40", "--plan.planner.spacing_m", "0.8"]
@@ -53,7 +49,7 @@ def planned(folder: Path, camera: Camera, method: str, film: str = "none") -> tu
     experiment = parse_command("plan", [*options(folder, camera), *ends, *lattice, *chosen])
     assert experiment is not None
 
-    def within(seconds: float) -> PlannedPath:
+    def within(seconds):
         planner = replace(experiment.plan.planner, time_s=seconds)
         return replace(experiment, plan=replace(experiment.plan, planner=planner)).run()
 
@@ -63,7 +59,7 @@ def planned(folder: Path, camera: Camera, method: str, film: str = "none") -> tu
 
 
 @pytest.mark.parametrize("method", ["visible", "set"])
-def test_a_views_score_is_that_of_its_very_pose(tmp_path: Path, method: str) -> None:
+def test_a_views_score_is_that_of_its_very_pose(tmp_path, method):
     """A rule that is planned by its ranks, and a learned method."""
     path, table, scorer = planned(tmp_path, OFF_CENTER, method)
     looking = poses_looking_along(path.positions, path.axes)
@@ -74,12 +70,12 @@ def test_a_views_score_is_that_of_its_very_pose(tmp_path: Path, method: str) -> 
     assert not np.allclose(table["score"], scorer.score(poses_looking_along(elsewhere, path.axes)), rtol=1e-3)
 
 
-def test_a_path_that_nobody_scores_has_no_scores(tmp_path: Path) -> None:
+def test_a_path_that_nobody_scores_has_no_scores(tmp_path):
     assert planned(tmp_path, OFF_CENTER, "forward")[1]["score"].isna().all()
 
 
 @pytest.mark.slow
-def test_a_fisheye_is_planned_for_and_shown(tmp_path: Path) -> None:
+def test_a_fisheye_is_planned_for_and_shown(tmp_path):
     _, table, scorer = planned(tmp_path, FISHEYE, "bins", "gif")
     assert scorer.localization_map.camera == FISHEYE and len(table) > 2
     np.testing.assert_allclose(table["score"], scorer.score(poses(table)), rtol=1e-9)

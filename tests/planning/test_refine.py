@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from planning.rooms import DIRECTIONS, GRID, free_voxels, room_landmarks, room_map
-from wheretolook.geometry.poses import Float
 from wheretolook.planning.stops import refine_directions
 from wheretolook.scorers.base import Scorer
 from wheretolook.scorers.registry import make_scorer
@@ -20,15 +19,15 @@ class Towards(Scorer):
     name: ClassVar[str] = "towards"
     axis = np.array([0.3, -0.5, 0.2]) / np.linalg.norm([0.3, -0.5, 0.2])
 
-    def score(self, cam_from_world: Float) -> Float:
+    def score(self, cam_from_world):
         return (1 + cam_from_world[:, 2, :3] @ self.axis) / 2
 
 
-def angle_deg(a: Float, b: Float) -> Float:
+def angle_deg(a, b):
     return np.degrees(2 * np.arcsin(np.linalg.norm(a - b, axis=-1) / 2))
 
 
-def test_a_smooth_maximum_is_found_within_the_last_step() -> None:
+def test_a_smooth_maximum_is_found_within_the_last_step():
     scorer = Towards(room_map(room_landmarks(10)))
     near = DIRECTIONS[np.argsort(-DIRECTIONS @ scorer.axis)[:3]]
     found = refine_directions(scorer, np.ones((3, 3)), 5 * near, 90, last_step_deg=0.1)
@@ -38,7 +37,7 @@ def test_a_smooth_maximum_is_found_within_the_last_step() -> None:
 
 
 @pytest.mark.parametrize("method", ["bins", "random"])
-def test_no_method_gets_worse_and_batches_change_nothing(method: str) -> None:
+def test_no_method_gets_worse_and_batches_change_nothing(method):
     scorer = make_scorer(method, room_map(room_landmarks(400)))
     locations = GRID.centers()[list(free_voxels())]
     scores = scorer.score_directions(locations, DIRECTIONS)
@@ -60,6 +59,6 @@ def test_no_method_gets_worse_and_batches_change_nothing(method: str) -> None:
     "locations, axes, angle",
     [([[0, 0, np.nan]], [[1, 0, 0]], 10), ([[0, 0, 0]], [[0, 0, 0]], 10), ([[0, 0, 0]], [[1, 0, 0]], 0)],
 )
-def test_invalid_input(locations: object, axes: object, angle: float) -> None:
+def test_invalid_input(locations, axes, angle):
     with pytest.raises(ValueError):
         refine_directions(Towards(room_map(room_landmarks(10))), locations, axes, angle)

@@ -1,19 +1,17 @@
 """Views along a path: the exact optimum against brute force, and limits on rotations."""
 
-from __future__ import annotations
-
 from itertools import product
 
 import numpy as np
 import pytest
 
 from wheretolook.geometry.lattices import direction_lattice, yaw_pitch_angles
-from wheretolook.geometry.poses import Float, rotation_angle_deg, rotation_looking_along
+from wheretolook.geometry.poses import rotation_angle_deg, rotation_looking_along
 from wheretolook.planning.view_sequence import TurnLimit, best_sequence
 from wheretolook.utils.errors import PlanningError
 
 
-def turns_of(ids: np.ndarray, directions: Float, start: Float | None = None) -> Float:
+def turns_of(ids, directions, start=None):
     rotations = rotation_looking_along(directions[ids])
     if start is not None:
         rotations = np.concatenate([rotation_looking_along(start)[None], rotations])
@@ -21,7 +19,7 @@ def turns_of(ids: np.ndarray, directions: Float, start: Float | None = None) -> 
 
 
 @pytest.mark.parametrize("seed", range(12))
-def test_no_sequence_is_better(seed: int) -> None:
+def test_no_sequence_is_better(seed):
     rng = np.random.default_rng(seed)
     n = rng.integers(1, 6)
     d = rng.integers(2, 7)
@@ -48,7 +46,7 @@ def test_no_sequence_is_better(seed: int) -> None:
     assert np.all(turns_of(found.direction_ids, directions, start) <= limit.max_turn_deg)
 
 
-def test_on_20_degrees_the_benchmarks_limit_leaves_the_eight_neighbours() -> None:
+def test_on_20_degrees_the_benchmarks_limit_leaves_the_eight_neighbours():
     angles = yaw_pitch_angles()
     limit = TurnLimit.of(direction_lattice(0, "yaw-pitch"))
     across = np.abs(angles[:, None] - angles) / 20
@@ -59,7 +57,7 @@ def test_on_20_degrees_the_benchmarks_limit_leaves_the_eight_neighbours() -> Non
         np.testing.assert_array_equal(near[near < 108], np.flatnonzero(expected[direction]))
 
 
-def test_unreachable_waypoint_is_reported() -> None:
+def test_unreachable_waypoint_is_reported():
     limit = TurnLimit.of(np.eye(3), 30)
     scores = np.ones((4, 3))
     with pytest.raises(PlanningError) as caught:
@@ -72,11 +70,11 @@ def test_unreachable_waypoint_is_reported() -> None:
 
 
 @pytest.mark.parametrize("scores", [np.ones((2, 4)), np.ones(3), np.empty((0, 3)), [[1, np.nan, 0]]])
-def test_invalid_scores(scores: object) -> None:
+def test_invalid_scores(scores):
     with pytest.raises(ValueError):
         best_sequence(scores, TurnLimit.of(np.eye(3)))
 
 
-def test_a_limit_is_a_number() -> None:
+def test_a_limit_is_a_number():
     with pytest.raises(ValueError):
         TurnLimit.of(np.eye(3), np.nan)

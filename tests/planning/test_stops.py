@@ -1,7 +1,5 @@
 """Stops: where one look will not do, the fewest further looks that reach what is asked, or that gain what they cost."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,7 +16,6 @@ from wheretolook.planning.method_paths import path_views
 from wheretolook.planning.routes import PlannedPath
 from wheretolook.planning.stops import stops_along, within_pitch
 from wheretolook.planning.view_sequence import TurnLimit, best_sequence
-from wheretolook.scorers.base import Scorer
 from wheretolook.scorers.registry import make_scorer
 from wheretolook.utils.errors import ConfigError
 
@@ -29,12 +26,12 @@ POSITIONS = np.linspace((0.8, 0.8, 1.4), (3.2, 0.8, 1.4), 5)
 
 
 @pytest.fixture(scope="module")
-def scorer() -> Scorer:
+def scorer():
     return make_scorer("set", LocalizationMap(Map(room_landmarks(300)), CAMERA, occlusion()), weights=WEIGHTS)
 
 
 @pytest.fixture(scope="module")
-def path(scorer: Scorer) -> PlannedPath:
+def path(scorer):
     """Level views along a given path, the worst at its end, which looks at a corner without landmarks."""
     level = DIRECTIONS[np.abs(DIRECTIONS[:, 2]) < 0.3]
     chosen = best_sequence(-scorer.score_directions(POSITIONS, level), TurnLimit.of(level, 40.0))
@@ -42,7 +39,7 @@ def path(scorer: Scorer) -> PlannedPath:
     return PlannedPath(POSITIONS, axes, scorer.score(poses_looking_along(POSITIONS, axes)), np.nan)
 
 
-def test_a_place_with_a_low_score_becomes_a_stop(scorer: Scorer, path: PlannedPath) -> None:
+def test_a_place_with_a_low_score_becomes_a_stop(scorer, path):
     asked = float(np.median(path.scores))
     given = (scorer, path.positions, path.axes, DIRECTIONS)
     stops = stops_along(*given, StopConfig(3, asked), PLANNER)
@@ -59,9 +56,7 @@ def test_a_place_with_a_low_score_becomes_a_stop(scorer: Scorer, path: PlannedPa
             assert by_two.get(stop.place, 0) < asked
 
 
-def test_where_the_requested_score_is_out_of_reach_a_stop_must_gain_more_than_it_costs(
-    scorer: Scorer, path: PlannedPath
-) -> None:
+def test_where_the_requested_score_is_out_of_reach_a_stop_must_gain_more_than_it_costs(scorer, path):
     config = StopConfig(2, 1.0)  # nothing is certain
     free = replace(PLANNER, turn_weight_m=0.0)
     stops = stops_along(scorer, path.positions, path.axes, DIRECTIONS, config, free)
@@ -75,7 +70,7 @@ def test_where_the_requested_score_is_out_of_reach_a_stop_must_gain_more_than_it
         assert gain > priced.turn_weight_m * np.radians(stop.turn_deg)
 
 
-def test_stops_are_off_by_default_and_need_probabilities(scorer: Scorer, path: PlannedPath) -> None:
+def test_stops_are_off_by_default_and_need_probabilities(scorer, path):
     rule = make_scorer("visible", scorer.localization_map)
     with pytest.raises(ConfigError):
         stops_along(rule, path.positions, path.axes, DIRECTIONS, StopConfig(2), PLANNER)
@@ -83,7 +78,7 @@ def test_stops_are_off_by_default_and_need_probabilities(scorer: Scorer, path: P
     assert stops_along(scorer, path.positions, path.axes, DIRECTIONS, StopConfig(3, 1e-6), PLANNER) == ()
 
 
-def test_the_looks_of_a_path_are_in_order(scorer: Scorer, path: PlannedPath) -> None:
+def test_the_looks_of_a_path_are_in_order(scorer, path):
     free = replace(PLANNER, turn_weight_m=0.0)
     stops = stops_along(scorer, path.positions, path.axes, DIRECTIONS, StopConfig(3, 0.999), free)
     some = replace(path, stops=(stops[1], stops[3]))
@@ -100,6 +95,6 @@ def test_the_looks_of_a_path_are_in_order(scorer: Scorer, path: PlannedPath) -> 
 
 
 @pytest.mark.parametrize("options", [(0, 0.7), (7, 0.7), (2, 0.0), (2, float("nan"))])
-def test_invalid_options(options: tuple[int, float]) -> None:
+def test_invalid_options(options):
     with pytest.raises(ConfigError):
         StopConfig(*options)

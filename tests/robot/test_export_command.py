@@ -1,10 +1,5 @@
 """`wheretolook export` from a COLMAP model to a folder that scores views."""
 
-from __future__ import annotations
-
-import json
-from pathlib import Path
-
 import numpy as np
 import pycolmap
 import pytest
@@ -29,23 +24,15 @@ WEIGHTS = shipped("data/release/weights/set.safetensors")
 
 
 @pytest.fixture
-def model(tmp_path: Path) -> Path:
+def model(tmp_path):
     return write_room(tmp_path / "sparse")
 
 
-def export(model: Path, out: Path, *options: str) -> int:
+def export(model, out, *options):
     return main(["export", "--map", str(model), "--out", str(out), "--weights", str(WEIGHTS), *options])
 
 
-def test_a_map_without_occlusion(model: Path, tmp_path: Path) -> None:
-    assert export(model, tmp_path / "robot") == 0
-    robot = RobotScorer(tmp_path / "robot")
-    assert robot.camera == {"width": 640, "height": 480, "fx": 320.0, "fy": 320.0, "cx": 320.0, "cy": 240.0}
-    view = robot.best((2.5, 2.5, 1.5), directions=100)
-    assert view.direction[:2].min() < -0.7 and view.n_visible > 40  # most landmarks are on two walls
-
-
-def test_a_mesh_and_the_camera_of_the_robot(model: Path, tmp_path: Path) -> None:
+def test_a_mesh_and_the_camera_of_the_robot(model, tmp_path):
     mesh = tmp_path / "room.glb"
     save_glb(furnished_room(), mesh)
     camera = "PINHOLE,640,480,400,410,320,240"
@@ -60,12 +47,13 @@ def test_a_mesh_and_the_camera_of_the_robot(model: Path, tmp_path: Path) -> None
     np.testing.assert_allclose(robot.score(views), expected, atol=1e-5, rtol=0)
 
 
-def test_the_accuracy_of_scores(model: Path, tmp_path: Path) -> None:
+def test_the_accuracy_of_scores(model, tmp_path):
     scores = []
     for options in ((), ("--accuracy", "0.05,0.4"), ("--accuracy", "0.5,5")):
         assert export(model, tmp_path / "robot", *options) == 0
-        scores.append(RobotScorer(tmp_path / "robot").score_directions([(2.5, 2.5, 1.5)], fibonacci_sphere(50))[0])
-        assert json.loads((tmp_path / "robot" / "robot.json").read_text())["accuracy"] in ([0.05, 0.4], [0.5, 5.0])
+        robot = RobotScorer(tmp_path / "robot")
+        scores.append(robot.score_directions([(2.5, 2.5, 1.5)], fibonacci_sphere(50))[0])
+    assert robot.camera == {"width": 640, "height": 480, "fx": 320.0, "fy": 320.0, "cx": 320.0, "cy": 240.0}
     np.testing.assert_array_equal(scores[0], scores[1])
     assert (scores[2] >= scores[0]).all() and scores[2].mean() > scores[0].mean() + 0.01
 
@@ -78,12 +66,12 @@ def test_the_accuracy_of_scores(model: Path, tmp_path: Path) -> None:
         ("--accuracy", "0,1"), ("--accuracy", "0.25"),
     ],
 )  # fmt: skip
-def test_invalid_options(options: tuple[str, ...], model: Path, tmp_path: Path) -> None:
+def test_invalid_options(options, model, tmp_path):
     assert export(model, tmp_path / "robot", *options) == 2
     assert not (tmp_path / "robot").exists()
 
 
-def test_the_robot_gives_positions_in_the_frame_of_the_map(model: Path, tmp_path: Path) -> None:
+def test_the_robot_gives_positions_in_the_frame_of_the_map(model, tmp_path):
     turn = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # to y down
     to_map = Similarity(20.0, turn, np.zeros(3))
     other = pycolmap.Reconstruction(model)

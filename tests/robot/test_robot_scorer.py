@@ -1,14 +1,12 @@
 """The exported scorer equals the PyTorch scorer for any weights, map, camera and poses."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil
 import subprocess
 import sys
 from dataclasses import replace
-from pathlib import Path
+from itertools import product
 
 import numpy as np
 import pytest
@@ -18,13 +16,13 @@ from torch import nn
 
 from box_scenes import ROOM, furnished_room
 from synthetic_dataset import CAMERA, make_landmarks
-from wheretolook.geometry.camera import Camera, ColmapCamera, PinholeCamera
+from wheretolook.geometry.camera import ColmapCamera, PinholeCamera
 from wheretolook.geometry.lattices import fibonacci_sphere
-from wheretolook.geometry.poses import Float, invert_poses, poses_looking_along
+from wheretolook.geometry.poses import invert_poses, poses_looking_along
 from wheretolook.inputs.channels import ATTRIBUTES
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.inputs.statistics import FeatureStatistics
-from wheretolook.mapping.landmarks import MAP_ATTRIBUTES, Landmarks
+from wheretolook.mapping.landmarks import MAP_ATTRIBUTES
 from wheretolook.mapping.map import Map
 from wheretolook.robot import wheretolook_robot
 from wheretolook.robot.export import export_robot, pinhole_of
@@ -49,7 +47,7 @@ CAMERAS = {
 }
 
 
-def some_poses(n: int, seed: int = 0) -> Float:
+def some_poses(n, seed=0):
     """Make poses in the middle of the box of `make_landmarks`, some with roll."""
     rng = np.random.default_rng(seed)
     poses = poses_looking_along(rng.uniform((-2, -2, 0.5), (2, 2, 2), (n, 3)), rng.normal(size=(n, 3)))
@@ -57,7 +55,7 @@ def some_poses(n: int, seed: int = 0) -> Float:
     return roll @ poses
 
 
-def walls(n: int, seed: int = 0) -> Landmarks:
+def walls(n, seed=0):
     """Make landmarks on the walls of a room, with some unknown attributes."""
     landmarks = make_landmarks(np.random.default_rng(seed), n)
     assert landmarks.mapping_focal_px is not None
@@ -68,9 +66,7 @@ def walls(n: int, seed: int = 0) -> Landmarks:
     return landmarks
 
 
-def random_network(
-    seed: int, attributes: tuple[str, ...] = ATTRIBUTES, **options: object
-) -> TrainedNetwork[SetNetwork]:
+def random_network(seed, attributes=ATTRIBUTES, **options):
     """Make a network with random weights and statistics."""
     torch.manual_seed(seed)
     rng = np.random.default_rng(seed)
@@ -96,44 +92,33 @@ NETWORKS = {
 
 @pytest.mark.parametrize(
     ("name", "camera"),
-    [*((name, CAMERAS["paper"]) for name in NETWORKS), *(("small", camera) for camera in CAMERAS.values())],
+    [*((name, CAMERAS["paper"]) for name in NETWORKS), *(("small", camera) for camera in [*CAMERAS.values()][1:])],
 )
-def test_scores_are_those_of_pytorch(name: str, camera: Camera, tmp_path: Path) -> None:
+def test_scores_are_those_of_pytorch(name, camera, tmp_path):
     weights = tmp_path / "set.safetensors"
     random_network(len(name), **NETWORKS[name]).save(weights)
     localization_map = LocalizationMap(Map(walls(1500, len(name))), camera)
     poses = some_poses(120, len(name))
     scorer = load_scorer(localization_map, weights)
-    expected = scorer.score(poses)
     robot = RobotScorer(export_robot(localization_map, weights, tmp_path / "robot"))
     views = robot.views(poses)
+    expected = scorer.score(poses)
     np.testing.assert_allclose(views.score, expected, atol=TOLERANCE, rtol=0)
     assert views.score.dtype == np.float64 and np.ptp(expected) > 100 * TOLERANCE
     np.testing.assert_array_equal(views.n_visible, np.diff(localization_map.landmarks_in_view(poses).starts))
     np.testing.assert_array_equal(views.in_range, scorer.in_range(poses))
     assert 0 < views.in_range.sum() < len(poses)
     np.testing.assert_allclose(robot.score(poses[7]), expected[7:8], atol=TOLERANCE, rtol=0)
-
-
-@pytest.mark.parametrize("name", NETWORKS)
-def test_scores_at_any_accuracy_are_those_of_pytorch(name: str, tmp_path: Path) -> None:
-    weights = tmp_path / "set.safetensors"
-    random_network(len(name), **NETWORKS[name]).save(weights)
-    localization_map = LocalizationMap(Map(walls(1500, len(name))), CAMERAS["paper"])
-    poses = some_poses(120, len(name))
-    for accuracy in ((0.001, 0.01), (0.02, 0.2), (0.25, 2.0), (1e3, 90.0), (np.inf, np.inf)):
-        for file in (weights, BUNDLED):
-            scorer = load_scorer(localization_map, file).at_accuracy(accuracy)
-            expected = scorer.score(poses)
-            folder = export_robot(localization_map, file, tmp_path / "robot", accuracy=accuracy)
-            views = RobotScorer(folder).views(poses)
-            np.testing.assert_allclose(views.score, expected, atol=TOLERANCE, rtol=0)
-            np.testing.assert_array_equal(views.in_range, scorer.in_range(poses))
-            assert json.loads((folder / "robot.json").read_text())["accuracy"] == [*accuracy]
+    accuracies = ((0.001, 0.01), (0.25, 2.0), (1e3, 90.0), (np.inf, np.inf)) if camera == CAMERAS["paper"] else ()
+    for file, accuracy in product((weights, BUNDLED), accuracies):
+        scorer = load_scorer(localization_map, file).at_accuracy(accuracy)
+        folder = export_robot(localization_map, file, tmp_path / "robot", accuracy=accuracy)
+        np.testing.assert_allclose(RobotScorer(folder).score(poses), scorer.score(poses), atol=TOLERANCE, rtol=0)
+        assert json.loads((folder / "robot.json").read_text())["accuracy"] == [*accuracy]
 
 
 @pytest.mark.parametrize("n", [1, 60, 25_000])
-def test_bundled_weights_on_maps_of_any_size(n: int, tmp_path: Path) -> None:
+def test_bundled_weights_on_maps_of_any_size(n, tmp_path):
     """From views without landmarks to views with more than are sampled."""
     localization_map = LocalizationMap(Map(walls(n, n)), CAMERAS["wide, upright"])
     poses = some_poses(80, n)
@@ -144,7 +129,7 @@ def test_bundled_weights_on_maps_of_any_size(n: int, tmp_path: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def room_map() -> LocalizationMap:
+def room_map():
     """Landmarks on the walls of a room with a cabinet, which occludes some of them."""
     rng = np.random.default_rng(5)
     points = rng.uniform((0, 0, 0), ROOM, (600, 3))
@@ -157,32 +142,29 @@ def room_map() -> LocalizationMap:
 
 
 @pytest.fixture(scope="module")
-def folder(room_map: LocalizationMap, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(room_map, tmp_path_factory):
     return export_robot(room_map, BUNDLED, tmp_path_factory.mktemp("robot") / "robot", PLACES, progress=False)
 
 
-def test_occlusion_is_that_of_the_nearest_place(room_map: LocalizationMap, folder: Path, tmp_path: Path) -> None:
+def test_occlusion_is_that_of_the_nearest_place(room_map, folder, tmp_path):
     scorer = load_scorer(room_map, BUNDLED)
     without = RobotScorer(export_robot(room_map, BUNDLED, tmp_path))
     robot = RobotScorer(folder)
-    axes = fibonacci_sphere(60)
     for at in PLACES:
-        poses = poses_looking_along(np.tile(at, (60, 1)), axes)
+        poses = poses_looking_along(np.tile(at, (60, 1)), fibonacci_sphere(60))
         views = robot.views(poses)
         np.testing.assert_allclose(views.score, scorer.score(poses), atol=TOLERANCE, rtol=0)
-        np.testing.assert_array_equal(views.n_visible, np.diff(room_map.landmarks_in_view(poses).starts))
         assert np.abs(views.place_distance).max() < 1e-9
         through_walls = without.views(poses)
         assert np.isnan(through_walls.place_distance).all()
         assert through_walls.n_visible.sum() > views.n_visible.sum() + 50
         unoccluded = room_map.occlusion.unoccluded(at[None], room_map.landmarks.points)[0]
         np.testing.assert_array_equal(without.views(poses, unoccluded).score, views.score)
-    np.testing.assert_allclose(
-        robot.views(poses_looking_along(PLACES[1] + (0.3, 0, -0.4), (0, 1, 0))).place_distance, 0.5
-    )
+    aside = robot.views(poses_looking_along(PLACES[1] + (0.3, 0, -0.4), (0, 1, 0)))
+    np.testing.assert_allclose(aside.place_distance, 0.5)
 
 
-def test_the_best_view_at_a_location(room_map: LocalizationMap, folder: Path) -> None:
+def test_the_best_view_at_a_location(room_map, folder):
     robot = RobotScorer(folder)
     axes = fibonacci_sphere(200)
     scores = load_scorer(room_map, BUNDLED).score(poses_looking_along(np.tile(PLACES[0], (200, 1)), axes))
@@ -190,22 +172,19 @@ def test_the_best_view_at_a_location(room_map: LocalizationMap, folder: Path) ->
     np.testing.assert_allclose(view.direction, axes[scores.argmax()], atol=1e-12)
     assert abs(view.score - scores.max()) < TOLERANCE
     np.testing.assert_allclose(view.cam_from_world, poses_looking_along(PLACES[0], view.direction), atol=1e-12)
-    np.testing.assert_allclose(
-        Rotation.from_quat(view.quaternion_xyzw).as_matrix(), invert_poses(view.cam_from_world)[:, :3], atol=1e-12
-    )
+    turn = Rotation.from_quat(view.quaternion_xyzw).as_matrix()
+    np.testing.assert_allclose(turn, invert_poses(view.cam_from_world)[:, :3], atol=1e-12)
     assert 0 < view.expected_inliers <= view.n_visible and view.place_distance < 1e-9
     level = np.abs(np.degrees(np.arcsin(axes[:, 2]))) <= 10
     chosen = robot.best(PLACES[0], directions=axes, pitch_deg=(-10, 10))
     np.testing.assert_allclose(chosen.direction, axes[level][scores[level].argmax()], atol=1e-12)
 
 
-def test_rotations_and_quaternions() -> None:
-    random = Rotation.random(200, random_state=0)
+def test_rotations_and_quaternions():
     special = [Rotation.from_quat(np.eye(4)), Rotation.from_euler("z", [[180], [179.99]], True)]
-    for rotation in Rotation.concatenate([random, *special]):
+    for rotation in Rotation.concatenate([Rotation.random(200, random_state=0), *special]):
         quaternion = wheretolook_robot.quaternion_xyzw(rotation.as_matrix())
         np.testing.assert_allclose(quaternion, rotation.as_quat(canonical=True), atol=1e-9)
-    np.testing.assert_allclose(wheretolook_robot.fibonacci_sphere(77), fibonacci_sphere(77), atol=1e-12)
     along = [*fibonacci_sphere(50), (0, 0, 1), (0, 0, -3)]
     expected = poses_looking_along(np.zeros((52, 3)), along)[:, :, :3]
     np.testing.assert_allclose(wheretolook_robot.rotations_looking_along(along), expected, atol=1e-12)
@@ -221,7 +200,7 @@ def test_rotations_and_quaternions() -> None:
         lambda robot: robot.best((0.0, np.nan, 1.0)),
     ],
 )
-def test_invalid_arguments(call, folder: Path) -> None:  # type: ignore[no-untyped-def]
+def test_invalid_arguments(call, folder):
     with pytest.raises(ValueError):
         call(RobotScorer(folder))
 
@@ -235,7 +214,7 @@ np.save("scores.npy", RobotScorer(".").score(np.load("poses.npy")))
 """
 
 
-def test_the_folder_runs_by_itself(folder: Path, tmp_path: Path) -> None:
+def test_the_folder_runs_by_itself(folder, tmp_path):
     copy = tmp_path / "robot"
     shutil.copytree(folder, copy)
     poses = some_poses(5)
@@ -248,10 +227,10 @@ def test_the_folder_runs_by_itself(folder: Path, tmp_path: Path) -> None:
         RobotScorer(copy)
 
 
-def setting(*keys: str, value: object):
+def setting(*keys, value):
     """An edit of robot.json; a value of None removes the setting."""
 
-    def edit(folder: Path) -> None:
+    def edit(folder):
         about = json.loads((folder / "robot.json").read_text())
         inner = about
         for key in keys[:-1]:
@@ -264,10 +243,10 @@ def setting(*keys: str, value: object):
     return edit
 
 
-def array(name: str, change):
+def array(name, change):
     """An edit of an array of landmarks.npz; None removes it."""
 
-    def edit(folder: Path) -> None:
+    def edit(folder):
         with np.load(folder / "landmarks.npz") as stored:
             arrays = dict(stored)
         arrays[name] = change(arrays[name])
@@ -276,7 +255,7 @@ def array(name: str, change):
     return edit
 
 
-def content(name: str, change):
+def content(name, change):
     return lambda folder: (folder / name).write_bytes(change((folder / name).read_bytes()))
 
 
@@ -299,14 +278,14 @@ DAMAGES = [
 
 
 @pytest.mark.parametrize("damage", DAMAGES)
-def test_damaged_folders_are_rejected_by_file(damage, folder: Path, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+def test_damaged_folders_are_rejected_by_file(damage, folder, tmp_path):
     copy = shutil.copytree(folder, tmp_path / "copy")
     damage(copy)
     with pytest.raises(ValueError, match=f"^{copy}.*Export again"):
         RobotScorer(copy)
 
 
-def test_devices_and_bombs_are_rejected(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_devices_and_bombs_are_rejected(folder, tmp_path, monkeypatch):
     copy = shutil.copytree(folder, tmp_path / "copy")
     monkeypatch.setattr("wheretolook.robot.wheretolook_robot.FREE_BYTES", 1000)
     with np.load(copy / "landmarks.npz") as stored:
@@ -324,7 +303,7 @@ def test_devices_and_bombs_are_rejected(folder: Path, tmp_path: Path, monkeypatc
             RobotScorer(copy)
 
 
-def test_cameras_and_weights_that_cannot_be_exported(room_map: LocalizationMap, tmp_path: Path) -> None:
+def test_cameras_and_weights_that_cannot_be_exported(room_map, tmp_path):
     opencv = ColmapCamera("OPENCV", 160, 120, (80.0, 81.0, 79.0, 60.5, -0.1, 0.01, 1e-3, -1e-3))
     assert pinhole_of(opencv) == PinholeCamera(160, 120, 80.0, 81.0, (79.0, 60.5))
     with pytest.raises(CameraError):

@@ -1,9 +1,5 @@
 """The kernels of baked light against plain twins in NumPy, where rays meet a box or a screen in closed form."""
 
-from __future__ import annotations
-
-from typing import Any
-
 import numpy as np
 import pytest
 import warp as wp
@@ -14,22 +10,22 @@ from wheretolook_rooms.light_kernels import direct_kernel, gather_kernel
 R2 = np.array([3242174889, 2447445414], dtype=np.uint64)
 
 
-def r2(index: np.ndarray) -> np.ndarray:
+def r2(index):
     """Points (..., 2) of Roberts' R2 sequence in 32-bit whole numbers."""
     return ((index.astype(np.uint64)[..., None] * R2) % 2**32) / 2**32
 
 
-def integers(values: Any, device: str) -> Any:
+def integers(values, device):
     return wp.array(np.asarray(values, dtype=np.int32), dtype=wp.int32, device=device)
 
 
-def quads(corners: np.ndarray, device: str) -> wp.Mesh:
+def quads(corners, device):
     """A mesh of quadrilaterals (Q, 4, 3)."""
     index = (np.array([0, 1, 2, 0, 2, 3]) + 4 * np.arange(len(corners))[:, None]).reshape(-1)
     return wp.Mesh(points=vec3_array(corners.reshape(-1, 3), device), indices=integers(index, device))
 
 
-def box(inward: bool) -> np.ndarray:
+def box(inward):
     """The six faces of the cube [-1, 1]^3, two for each axis, low side first."""
     faces = []
     for axis in range(3):
@@ -43,9 +39,7 @@ def box(inward: bool) -> np.ndarray:
     return np.stack(faces)
 
 
-def direct(
-    screen: np.ndarray, points: np.ndarray, normals: np.ndarray, lamps: np.ndarray, rays: int, device: str
-) -> Any:
+def direct(screen, points, normals, lamps, rays, device):
     """Light at points from a window in the plane x = 2 (1 m square, facing -x, radiance 1) and from white lamps."""
     device = start_warp(device)
     mesh = quads(screen, device)
@@ -68,7 +62,7 @@ WALL = np.array([[[1.0, -9, -9], [1, 9, -9], [1, 9, 9], [1, -9, 9]]])
 """`SCREEN` blocks rays that cross the plane x = 1 at y > -0.4, `WALL` all rays to the window."""
 
 
-def test_window_light_is_that_of_its_plain_twin(device: str) -> None:
+def test_window_light_is_that_of_its_plain_twin(device):
     rng = np.random.default_rng(0)
     points = rng.uniform([-1, -1, -1], [0.5, 1, 1], (50, 3))
     normals = rng.normal(size=(50, 3)) + np.array([1.5, 0, 0])
@@ -92,7 +86,7 @@ def test_window_light_is_that_of_its_plain_twin(device: str) -> None:
 
 
 @pytest.mark.parametrize("height_m", [0.5, 1.0, 2.0])
-def test_lamp_light_falls_with_the_square_of_the_distance(height_m: float, device: str) -> None:
+def test_lamp_light_falls_with_the_square_of_the_distance(height_m, device):
     points = np.zeros((200, 3))
     normals = np.tile([0.0, 0, 1], (200, 1))
     light = direct(WALL, points, normals, np.array([[0.0, 0, height_m]]), 4, device)
@@ -100,9 +94,7 @@ def test_lamp_light_falls_with_the_square_of_the_distance(height_m: float, devic
     assert np.all(direct(WALL, points, -normals, np.array([[0.0, 0, height_m]]), 4, device)[:, 0] == 0)
 
 
-def gather(
-    faces: np.ndarray, points: np.ndarray, normals: np.ndarray, brightness: np.ndarray, rays: int, device: str
-) -> Any:
+def gather(faces, points, normals, brightness, rays, device):
     """Light reflected by the faces of a box, each of one brightness, and the shares of open and back rays."""
     device = start_warp(device)
     mesh = quads(faces, device)
@@ -120,7 +112,7 @@ def gather(
     return bounced.numpy(), shares[0].numpy(), shares[1].numpy()
 
 
-def test_gathered_light_is_that_of_its_plain_twin(device: str) -> None:
+def test_gathered_light_is_that_of_its_plain_twin(device):
     rng = np.random.default_rng(1)
     points = rng.uniform(-0.9, 0.9, (40, 3))
     normals = rng.normal(size=(40, 3))
@@ -144,7 +136,7 @@ def test_gathered_light_is_that_of_its_plain_twin(device: str) -> None:
     assert np.all(back_share == 0)
 
 
-def test_a_uniform_box_throws_back_albedo_times_light_and_its_backs_are_noticed(device: str) -> None:
+def test_a_uniform_box_throws_back_albedo_times_light_and_its_backs_are_noticed(device):
     points = np.zeros((4, 3))
     normals = np.eye(4, 3) + np.eye(4, 3, -3)
     bounced, _, back = gather(box(inward=True), points, normals, np.full(6, 0.8), 32, device)

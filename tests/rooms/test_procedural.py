@@ -1,14 +1,10 @@
 """The procedural apartment: closed, reachable, deterministic, and both plain and rich in texture."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
 from functools import cache
-from typing import Any
 
 import numpy as np
+import open3d as o3d
 import pytest
-from numpy.typing import NDArray
 from scipy import ndimage
 
 from wheretolook.scenes.config import ApartmentConfig
@@ -17,7 +13,7 @@ from wheretolook_rooms import decor, fixtures, furniture
 from wheretolook_rooms import patches as patches_module
 from wheretolook_rooms.generator import furnish_apartment
 from wheretolook_rooms.materials import plain
-from wheretolook_rooms.plan import Plan, draw_plan
+from wheretolook_rooms.plan import draw_plan
 from wheretolook_rooms.style import Style
 
 SEEDS = (0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2)))
@@ -25,40 +21,37 @@ CONFIG = ApartmentConfig()
 
 
 @cache
-def furnished(seed: int) -> tuple[Plan, patches_module.Surface]:
+def furnished(seed):
     plan, patches, _, _ = furnish_apartment(CONFIG, seed)
     return plan, patches_module.join(patches)
 
 
-def _raycasting_scene(surface: patches_module.Surface) -> Any:
-    import open3d as o3d
-
+def _raycasting_scene(surface):
     scene = o3d.t.geometry.RaycastingScene()
-    scene.add_triangles(
-        o3d.core.Tensor(surface.vertices.astype(np.float32)), o3d.core.Tensor(surface.triangles.astype(np.uint32))
-    )
+    vertices, triangles = surface.vertices.astype(np.float32), surface.triangles.astype(np.uint32)
+    scene.add_triangles(o3d.core.Tensor(vertices), o3d.core.Tensor(triangles))
     return scene
 
 
-def _cast(scene: Any, origins: NDArray[Any], directions: NDArray[Any]) -> dict[str, NDArray[Any]]:
-    import open3d as o3d
-
+def _cast(scene, origins, directions):
     rays = np.concatenate(np.broadcast_arrays(origins, directions), -1).astype(np.float32)
     return {name: values.numpy() for name, values in scene.cast_rays(o3d.core.Tensor(rays)).items()}
 
 
+def _unit_vectors(rng):
+    vectors = rng.normal(size=(20_000, 3))
+    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+
+
 @pytest.mark.parametrize("seed", SEEDS)
-def test_shell_is_closed(seed: int) -> None:
+def test_shell_is_closed(seed):
     plan, surface = furnished(seed)
     scene = _raycasting_scene(surface)
-    directions = np.random.default_rng(seed).normal(size=(20_000, 3))
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    low = surface.vertices.min(0) - 1e-4
-    high = surface.vertices.max(0) + 1e-4
+    directions = _unit_vectors(np.random.default_rng(seed))
+    low, high = surface.vertices.min(0) - 1e-4, surface.vertices.max(0) + 1e-4
     for room in plan.rooms:
         centre = np.array([(room.x0 + room.x1) / 2, (room.y0 + room.y1) / 2, plan.height - 0.75])
         hit = _cast(scene, centre, directions)
-        assert np.isfinite(hit["t_hit"]).all()
         ends = centre + hit["t_hit"][:, None] * directions
         assert ((ends > low) & (ends < high)).all()
         front = (hit["primitive_normals"] * directions).sum(1) < 0
@@ -66,7 +59,7 @@ def test_shell_is_closed(seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_every_room_is_reached_on_foot(seed: int) -> None:
+def test_every_room_is_reached_on_foot(seed):
     """Flood fill over the floor: where nothing stands between 0.05 m and 1.9 m, shrunk by a walker of 0.4 m width."""
     plan, surface = furnished(seed)
     scene = _raycasting_scene(surface)
@@ -85,7 +78,7 @@ def test_every_room_is_reached_on_foot(seed: int) -> None:
         assert (labels[inside] == main).sum() * step**2 > 0.5, f"{room.kind} cannot be entered"
 
 
-FURNITURE: dict[str, Callable[[Style], list[patches_module.Patch]]] = {
+FURNITURE = {
     "sofa": lambda s: furniture.sofa(s, 3),
     "bed": lambda s: furniture.bed(s, 1.6),
     "chair": lambda s: furniture.chair(s, s.wood, s.upholstery),
@@ -97,56 +90,60 @@ FURNITURE: dict[str, Callable[[Style], list[patches_module.Patch]]] = {
 
 
 @pytest.mark.parametrize("name", FURNITURE)
-def test_furniture_is_closed_and_faces_outward(name: str) -> None:
+def test_furniture_is_closed_and_faces_outward(name):
     """With equal points merged, each directed edge occurs as often as its reverse; rays from outside meet a front."""
     surface = patches_module.join(FURNITURE[name](Style(np.random.default_rng(3), 0.5, 0.5)))
     _, point = np.unique(np.floor(surface.vertices * 1e6 + 0.33), axis=0, return_inverse=True)
     corner = point.ravel()[surface.triangles]
     edges = np.concatenate([corner[:, [0, 1]], corner[:, [1, 2]], corner[:, [2, 0]]])
     edges = edges[edges[:, 0] != edges[:, 1]]
-    key = np.sort(edges, axis=1)
-    sign = np.where(edges[:, 0] < edges[:, 1], 1, -1)
-    _, which = np.unique(key, axis=0, return_inverse=True)
+    sign = np.sign(edges[:, 1] - edges[:, 0])
+    _, which = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True)
     assert (np.bincount(which.ravel(), weights=sign) == 0).all()
 
-    scene = _raycasting_scene(surface)
     rng = np.random.default_rng(0)
-    low = surface.vertices.min(0)
-    high = surface.vertices.max(0)
-    directions = rng.normal(size=(20_000, 3))
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    origins = rng.uniform(low, high, (20_000, 3)) - 2 * np.linalg.norm(high - low) * directions
-    hit = _cast(scene, origins, directions)
+    low, high = surface.vertices.min(0), surface.vertices.max(0)
+    directions = _unit_vectors(rng)
+    origins = rng.uniform(low, high, directions.shape) - 2 * np.linalg.norm(high - low) * directions
+    hit = _cast(_raycasting_scene(surface), origins, directions)
     struck = np.isfinite(hit["t_hit"])
     front = (hit["primitive_normals"] * directions).sum(1) < 1e-6
-    assert struck.mean() > 0.05
-    assert front[struck].mean() > 0.999
+    assert struck.mean() > 0.05 and front[struck].mean() > 0.999
 
 
-def test_closed_primitives_enclose_their_volume() -> None:
+SIDES = 64
+CIRCLE = 0.5 * SIDES * np.sin(2 * np.pi / SIDES)  # area of the polygon in a unit circle
+SHEET = np.stack(np.meshgrid([0.5, -0.5], [0.0], [1.0, 0.0], indexing="ij"), -1)[:, 0].transpose(1, 0, 2)
+
+
+@pytest.mark.parametrize(
+    ("make", "expected", "tolerance"),
+    [
+        (lambda paint: patches_module.box((1, 2, 3), (1.5, 2.4, 3.3), paint), 0.5 * 0.4 * 0.3, 1e-6),
+        (lambda paint: patches_module.cylinder(0.3, 0.2, 0.9, paint, sides=SIDES), CIRCLE * 0.3**2 * 0.7, 1e-6),
+        (
+            lambda paint: patches_module.tube([(0, 0, z) for z in (0, 0.5, 1)], 0.1, paint, sides=SIDES),
+            CIRCLE * 0.01,
+            1e-6,
+        ),
+        # a box of edge 2 rounded to a sphere of radius 1, from the inside
+        (
+            lambda paint: patches_module.cushion((-1,) * 3, (1,) * 3, paint, radius_m=1.0, rounding=12),
+            4 / 3 * np.pi,
+            0.03,
+        ),
+        (lambda paint: patches_module.slab_between(SHEET, SHEET - (0, 0.1, 0), paint, (1, 1)), 0.1, 1e-6),
+    ],
+)
+def test_closed_primitives_enclose_their_volume(make, expected, tolerance):
     """Divergence theorem: the signed volume of a closed outward-facing surface is that of the solid."""
-    paint = plain(np.random.default_rng(0), (0.5, 0.5, 0.5))
-
-    def volume(patches: list[patches_module.Patch]) -> float:
-        surface = patches_module.join(patches)
-        a, b, c = (surface.vertices[surface.triangles[:, k]] for k in range(3))
-        return float((a * np.cross(b, c)).sum() / 6)
-
-    assert volume(patches_module.box((1, 2, 3), (1.5, 2.4, 3.3), paint)) == pytest.approx(0.5 * 0.4 * 0.3)
-    sides = 64
-    prism = 0.5 * sides * np.sin(2 * np.pi / sides) * 0.3**2 * 0.7
-    assert volume(patches_module.cylinder(0.3, 0.2, 0.9, paint, sides=sides)) == pytest.approx(prism)
-    tube = patches_module.tube([(0, 0, 0), (0, 0, 0.5), (0, 0, 1)], 0.1, paint, sides=sides)
-    assert volume(tube) == pytest.approx(0.5 * sides * np.sin(2 * np.pi / sides) * 0.1**2)
-    # a box of edge 2 rounded to a sphere of radius 1, from the inside
-    ball = volume(patches_module.cushion((-1, -1, -1), (1, 1, 1), paint, radius_m=1.0, rounding=12))
-    assert 0.97 * 4 / 3 * np.pi < ball < 4 / 3 * np.pi
-    front = np.stack(np.meshgrid([0.5, -0.5], [0.0], [1.0, 0.0], indexing="ij"), -1)[:, 0].transpose(1, 0, 2)
-    sheet = patches_module.slab_between(front, front - np.array([0, 0.1, 0]), paint, (1, 1))
-    assert volume(sheet) == pytest.approx(0.1)
+    surface = patches_module.join(make(plain(np.random.default_rng(0), (0.5, 0.5, 0.5))))
+    a, b, c = (surface.vertices[surface.triangles[:, k]] for k in range(3))
+    volume = (a * np.cross(b, c)).sum() / 6
+    assert volume == pytest.approx(expected, rel=tolerance) and volume < expected * (1 + 1e-6)
 
 
-def test_plans_are_sound() -> None:
+def test_plans_are_sound():
     for seed in range(30):
         n_rooms = 3 + seed % 4
         plan = draw_plan(np.random.default_rng(seed), n_rooms, 13.0 * n_rooms, 0.5)
@@ -163,7 +160,7 @@ def test_plans_are_sound() -> None:
                 assert min(a.x1, b.x1) <= max(a.x0, b.x0) or min(a.y1, b.y1) <= max(a.y0, b.y0)
 
 
-def test_apartments_of_before_keep_their_key() -> None:
+def test_apartments_of_before_keep_their_key():
     before = {
         "n_rooms": None, "area_m2": None, "texture_richness": 0.85, "clutter": 0.85, "dark_rooms": 0.2,
         "texels_per_m": 125.0, "texture_size": 4096, "light_spacing_m": 0.1, "light_rays": 24,
@@ -176,6 +173,6 @@ def test_apartments_of_before_keep_their_key() -> None:
     "options",
     [{"n_rooms": 2}, {"repetition": -0.1}, {"enlarged": 0.0}, {"clutter": 1.5}, {"area_m2": 5.0}, {"light_rays": 0}],
 )
-def test_invalid_options_are_rejected(options: dict[str, float]) -> None:
+def test_invalid_options_are_rejected(options):
     with pytest.raises(ConfigError):
-        ApartmentConfig(**options)  # type: ignore[arg-type]
+        ApartmentConfig(**options)

@@ -1,7 +1,5 @@
 """Changed scenes: pieces are moved as they are or are gone, all else stays, and the light is another."""
 
-from __future__ import annotations
-
 from functools import cache
 from itertools import groupby
 
@@ -9,13 +7,12 @@ import numpy as np
 import pytest
 from scipy.spatial.distance import pdist
 
-from wheretolook.geometry.mesh import TexturedMesh
-from wheretolook.scenes.config import ApartmentConfig, SceneKind
+from wheretolook.scenes.config import ApartmentConfig
 from wheretolook_rooms import atlas, furniture
 from wheretolook_rooms.building import building
 from wheretolook_rooms.court import court
 from wheretolook_rooms.generator import apartment, generate_scene
-from wheretolook_rooms.large import SUN_M, Furnished
+from wheretolook_rooms.large import SUN_M
 from wheretolook_rooms.materials import NoiseBank
 from wheretolook_rooms.office import office
 from wheretolook_rooms.patches import Patch, join
@@ -29,24 +26,24 @@ Runs = list[tuple[list[Patch], list[Patch]]]
 
 
 @cache
-def drawn(kind: str, strength: float) -> tuple[Furnished, Furnished]:
+def drawn(kind, strength):
     """A scene and the same changed."""
     scene = MAKE[kind](FAST, SEED)
     return scene, changed(scene, strength, SEED)
 
 
 @cache
-def mesh(changes: float = 0.0) -> TexturedMesh:
+def mesh(changes=0.0):
     return generate_scene("apartment", FAST, SEED, changes=changes)[0]
 
 
-def sorted_runs(kind: str, strength: float) -> tuple[Runs, Runs, Runs, Runs]:
+def sorted_runs(kind, strength):
     """Runs of patches before and after: what is fixed, pieces that stay, are moved, are removed."""
     before, after = drawn(kind, strength)
-    fixed: Runs = []
-    still: Runs = []
-    moved: Runs = []
-    removed: Runs = []
+    fixed = []
+    still = []
+    moved = []
+    removed = []
     end = 0
     for piece, parts in groupby(before.patches, key=lambda patch: patch.piece):
         old = [*parts]
@@ -63,33 +60,33 @@ def sorted_runs(kind: str, strength: float) -> tuple[Runs, Runs, Runs, Runs]:
     return fixed, still, moved, removed
 
 
-def points(patches: list[Patch]) -> np.ndarray:
+def points(patches):
     return np.concatenate([patch.positions.reshape(-1, 3) for patch in patches])
 
 
 @pytest.mark.parametrize("kind", ["apartment", "office", pytest.param("building", marks=pytest.mark.slow)])
-def test_pieces_are_moved_rigidly_or_are_gone_and_all_else_stays(kind: str) -> None:
+def test_pieces_are_moved_rigidly_or_are_gone_and_all_else_stays(kind):
     fixed, still, moved, removed = sorted_runs(kind, 1.0)
     assert all(a is b for old, new in [*fixed, *still] for a, b in zip(old, new, strict=True))
     pieces = len(still) + len(moved) + len(removed)
     assert pieces > 15 and 0.1 < len(removed) / pieces < 0.45 and len(moved) >= 3
+    assert all(patch.piece is not None for old, _ in removed for patch in old)
     for old, new in moved:
-        turned_about = [(points(run).min(0) + points(run).max(0)) / 2 for run in (old, new)]
-        assert (np.abs(np.subtract(*turned_about)) <= REACH_M + 0.5).all()  # turning changes the bounds
-        np.testing.assert_allclose(points(new)[:, 2], points(old)[:, 2], atol=1e-9)  # it stands as high as before
-        np.testing.assert_allclose(pdist(points(new)[::7]), pdist(points(old)[::7]), atol=1e-9)
-        assert [a.material is b.material for a, b in zip(old, new, strict=True)] == [True] * len(old)
-    for old, _ in removed:
-        assert all(patch.piece is not None for patch in old)
+        before, after = points(old), points(new)
+        shift = (before.min(0) + before.max(0) - after.min(0) - after.max(0)) / 2
+        assert (np.abs(shift) <= REACH_M + 0.5).all()  # turning changes the bounds
+        np.testing.assert_allclose(after[:, 2], before[:, 2], atol=1e-9)  # it stands as high as before
+        np.testing.assert_allclose(pdist(after[::7]), pdist(before[::7]), atol=1e-9)
+        assert all(a.material is b.material for a, b in zip(old, new, strict=True))
 
 
-def bounds(patches: list[Patch]) -> tuple[np.ndarray, np.ndarray]:
+def bounds(patches):
     """The least and greatest coordinates (P, 3) of each patch."""
     each = [points([patch]) for patch in patches]
     return np.array([p.min(0) for p in each]), np.array([p.max(0) for p in each])
 
 
-def test_moved_pieces_stand_on_something_and_do_not_overlap() -> None:
+def test_moved_pieces_stand_on_something_and_do_not_overlap():
     _, after = drawn("apartment", 1.0)
     *_, moved, _ = sorted_runs("apartment", 1.0)
     present = [patch for patch in after.patches if len(patch.triangles()[0])]
@@ -104,12 +101,12 @@ def test_moved_pieces_stand_on_something_and_do_not_overlap() -> None:
         assert not inside.all(2).any()
 
 
-def test_more_changes_at_a_higher_strength() -> None:
+def test_more_changes_at_a_higher_strength():
     counts = [len(moved) + len(removed) for *_, moved, removed in (sorted_runs("apartment", s) for s in (0.2, 0.6, 1))]
     assert 0 < counts[0] < counts[1] < counts[2]
 
 
-def test_patterns_stay_where_they_are_in_the_texture() -> None:
+def test_patterns_stay_where_they_are_in_the_texture():
     scene, after = drawn("apartment", 1.0)
     plans = [atlas.plan_atlas(one.patches, 10, 2048) for one in (scene, after)]
     np.testing.assert_array_equal(plans[0].corners, plans[1].corners)
@@ -119,41 +116,37 @@ def test_patterns_stay_where_they_are_in_the_texture() -> None:
     assert all(np.array_equal(a, b) for a, b in zip(*albedos, strict=True))
 
 
-def test_the_changed_mesh_differs_in_light_and_things_and_follows_from_the_seed() -> None:
-    before = mesh()
-    after = mesh(0.8)
+def test_the_changed_mesh_differs_in_light_and_things_and_follows_from_the_seed():
+    before, after = mesh(), mesh(0.8)
     again, mapped = generate_scene("apartment", FAST, SEED, changes=0.8)
     for name in ("vertices", "triangles", "corner_uvs"):
         assert getattr(after, name).tobytes() == getattr(again, name).tobytes()
     assert after.textures[0].tobytes() == again.textures[0].tobytes() and not mapped
-    assert before.textures[0].shape == after.textures[0].shape and len(after.triangles) < len(before.triangles)
+    assert len(after.triangles) < len(before.triangles)
     np.testing.assert_array_equal(before.bounds, after.bounds)
     scene, changed_scene = drawn("apartment", 0.8)
     surface = join(scene.patches)
-    fixed = np.array([patch.piece is None for patch in scene.patches])[surface.patch]
-    corners = surface.triangles[fixed]
+    corners = surface.triangles[np.array([patch.piece is None for patch in scene.patches])[surface.patch]]
     np.testing.assert_array_equal(before.vertices[corners], after.vertices[corners])  # the shell and what is built in
     # windows and lamp shades glow as before, while the light on much else is another
-    panes = [k for k, patch in enumerate(scene.patches) if patch.material.emissive]
-    assert all(changed_scene.patches[k].material.emissive for k in panes)
-    for one in panes:
-        uv = before.corner_uvs[surface.patch == one] * before.textures[0].shape[1::-1]
-        low = np.ceil(uv.min((0, 1))).astype(int)
-        high = uv.max((0, 1)).astype(int)
-        part = np.s_[low[1] : high[1], low[0] : high[0]]
-        np.testing.assert_array_equal(before.textures[0][part], after.textures[0][part])
     difference = np.abs(before.textures[0].astype(int) - after.textures[0]).max(-1)
+    for pane, patch in enumerate(scene.patches):
+        if patch.material.emissive:
+            assert changed_scene.patches[pane].material.emissive
+            uv = before.corner_uvs[surface.patch == pane] * difference.shape[::-1]
+            low, high = np.ceil(uv.min((0, 1))).astype(int), uv.max((0, 1)).astype(int)
+            assert not difference[low[1] : high[1], low[0] : high[0]].any()
     assert (difference > 12).mean() > 0.1
 
 
-def test_without_changes_a_scene_is_the_scene() -> None:
+def test_without_changes_a_scene_is_the_scene():
     plain = generate_scene("apartment", FAST, SEED, changes=0.0)[0]
     assert plain.textures[0].tobytes() == mesh().textures[0].tobytes()
     assert plain.vertices.tobytes() == mesh().vertices.tobytes()
 
 
 @pytest.mark.parametrize("kind", ["apartment", "office"])
-def test_lamps_are_brighter_or_dimmer(kind: SceneKind) -> None:
+def test_lamps_are_brighter_or_dimmer(kind):
     before, after = drawn(kind, 0.6)
     factors = [np.divide(b.colour, a.colour) for a, b in zip(before.lamps, after.lamps, strict=True)]
     assert np.ptp(factors, axis=1) == pytest.approx(0, abs=1e-9)
@@ -161,7 +154,7 @@ def test_lamps_are_brighter_or_dimmer(kind: SceneKind) -> None:
     assert [lamp.position for lamp in before.lamps] == [lamp.position for lamp in after.lamps]
 
 
-def test_a_court_has_another_sun_or_none() -> None:
+def test_a_court_has_another_sun_or_none():
     suns = []
     for seed in range(6):
         before = court(FAST, seed)
@@ -172,7 +165,7 @@ def test_a_court_has_another_sun_or_none() -> None:
     assert 0 < sum(suns) < 6
 
 
-def test_a_chair_copied_with_fixed_things_between_is_several_pieces() -> None:
+def test_a_chair_copied_with_fixed_things_between_is_several_pieces():
     """Offices place one chair many times, always after its desk."""
     fixed, still, moved, removed = sorted_runs("office", 1.0)
     chair = len(furniture.chair(style := Style(np.random.default_rng(0), 0.5, 0.5), style.wood, style.upholstery))

@@ -7,9 +7,6 @@ by quarters. Prints the share of places with a confident pose, how many of these
 how many of the first images' poses are right.
 """
 
-from __future__ import annotations
-
-import argparse
 import os
 import sys
 import time
@@ -20,12 +17,13 @@ import numpy as np
 import pandas as pd
 
 ROOT = Path(__file__).parents[2]
-sys.path[:0] = [str(ROOT / "tests"), str(ROOT / "src" / "wheretolook_ros")]
+sys.path[:0] = [str(ROOT / "tests"), str(ROOT / "tests" / "benchmarks"), str(ROOT / "src" / "wheretolook_ros")]
 
 import rclpy
+from common import options as parse_options
 from geometry_msgs.msg import PoseStamped
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
-from wheretolook_ros.conversions import Array, pose_matrix, pose_message, seconds
+from wheretolook_ros.conversions import pose_matrix, pose_message, seconds
 
 from ros.processes import CAMERA, HEAD, JOINTS, Robot, environment, running
 from wheretolook.geometry.poses import compose_poses, invert_poses, pose_error
@@ -41,13 +39,13 @@ PATIENCE_S = 150.0
 REC_709 = (0.2126, 0.7152, 0.0722)
 
 
-def random_bases(mesh: Path, folder: Path, n: int, seed: int) -> list[Array]:
+def random_bases(mesh, folder, n, seed):
     """Poses of the base whose camera is at a random free location, in a random direction."""
     rng = np.random.default_rng(seed)
     space = FreeSpace(load_mesh(mesh))
     with np.load(folder / "landmarks.npz") as stored:
         places = stored["places"]
-    bases: list[Array] = []
+    bases = []
     while len(bases) < n:
         at = places[rng.integers(len(places))] + rng.uniform(-0.2, 0.2, 3)
         if space.is_free(at[None])[0] and 0.9 < at[2] - space.floor_below(at[None])[0] < 1.7:
@@ -60,19 +58,19 @@ def random_bases(mesh: Path, folder: Path, n: int, seed: int) -> list[Array]:
 class Trial:
     """What happens at one place."""
 
-    def __init__(self, node: Robot, base: Array, policy: str, max_views: int) -> None:
+    def __init__(self, node, base, policy, max_views):
         self.node = node
         self.base = base
         self.policy = policy
         self.max_views = max_views
-        self.axes: list[Array] = []  # of distinct views
+        self.axes = []  # of distinct views
         self.places = node.place
         node.received.clear()
         message = PoseStamped(pose=pose_message(base))
         message.header.frame_id = "map"
         self.places.publish(message)
 
-    def row(self) -> dict[str, object]:
+    def row(self):
         """Look until confident or out of views; returns the outcome."""
         end = time.monotonic() + PATIENCE_S
         begin = time.monotonic()
@@ -99,38 +97,32 @@ class Trial:
                 break
         return self._outcome(None, time.monotonic() - begin)
 
-    def _here(self, truths: dict[float, Array], stamp: float) -> bool:
+    def _here(self, truths, stamp):
         truth = truths.get(round(stamp, 4))
         camera = compose_poses(self.base, HEAD.base_from_camera(0, 0))[:, 3]
         return truth is not None and np.linalg.norm(truth[:, 3] - camera) < 1e-3
 
-    def _count(self, truth: Array) -> None:
+    def _count(self, truth):
         axis = truth[:, 2]
         if all(axis @ other < np.cos(np.radians(DISTINCT_DEG)) for other in self.axes):
             self.axes.append(axis)
 
-    def _lost(self, truth: Array) -> None:
+    def _lost(self, truth):
         self._count(truth)
         if self.policy == "even" and len(self.axes) <= self.max_views:
             pan = np.radians(EVEN_PAN_DEG[len(self.axes)])
             point = JointTrajectoryPoint(positions=[float(pan), 0.0])
             self.node.head.publish(JointTrajectory(joint_names=JOINTS, points=[point]))
 
-    def _outcome(self, found: Array | None, elapsed: float) -> dict[str, object]:
+    def _outcome(self, found, elapsed):
         error_m, error_deg = (
             (np.nan, np.nan) if found is None else pose_error(invert_poses(found), invert_poses(self.base))
         )
-        views = min(len(self.axes), self.max_views)
-        return {
-            "confident": found is not None,
-            "views": views,
-            "error_m": error_m,
-            "error_deg": error_deg,
-            "s": elapsed,
-        }
+        outcome = {"confident": found is not None, "views": min(len(self.axes), self.max_views)}
+        return {**outcome, "error_m": error_m, "error_deg": error_deg, "s": elapsed}
 
 
-def first_poses(mesh: Path, folder: Path, bases: list[Array]) -> list[dict[str, object]]:
+def first_poses(mesh, folder, bases):
     """The pose that the first image alone gives, whatever its probability."""
     renderer = WarpRenderer(load_mesh(mesh))
     localizer = RobotLocalizer(folder)
@@ -139,14 +131,14 @@ def first_poses(mesh: Path, folder: Path, bases: list[Array]) -> list[dict[str, 
         pose = invert_poses(compose_poses(base, HEAD.base_from_camera(0, 0)))
         grey = (renderer.render(CAMERA, pose[None]).rgb[0] @ REC_709).astype(np.uint8)
         result = localizer.localize([localizer.match(*localizer.extract(grey))])
-        row: dict[str, object] = {"first_m": np.nan, "first_deg": np.nan, "first_probability": result.probability}
+        row = {"first_m": np.nan, "first_deg": np.nan, "first_probability": result.probability}
         if result.joint.status == "localized":
             row["first_m"], row["first_deg"] = pose_error(result.poses[0].cam_from_world, pose)
         rows.append(row)
     return rows
 
 
-def summary(table: pd.DataFrame) -> str:
+def summary(table):
     """Describe the outcome of all places."""
     sure = table[table["confident"]]
     lines = [f"{len(table)} places, confident {100 * len(sure) / len(table):.1f} %, views {table['views'].mean():.2f}, "
@@ -161,17 +153,9 @@ def summary(table: pd.DataFrame) -> str:
     return "\n".join(lines)
 
 
-def main() -> None:
+def main():
     """Run and print."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--mesh", type=Path, required=True)
-    parser.add_argument("--folder", type=Path, required=True)
-    parser.add_argument("--places", type=int, default=30)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--views", type=int, default=6)
-    parser.add_argument("--policy", choices=("gain", "even"), default="gain")
-    parser.add_argument("--out", type=Path)
-    options = parser.parse_args()
+    options = parse_options(__doc__, mesh=..., folder=..., places=30, seed=0, views=6, policy="gain", out=Path)
     os.environ.update(environment())
     bases = random_bases(options.mesh, options.folder, options.places, options.seed)
     first = first_poses(options.mesh, options.folder, bases)

@@ -6,17 +6,12 @@ Needs rosbags. The robot is placed at the start of a planned path in a random di
 then drives while the gaze node points the camera. The bag has what the nodes and the robot publish.
 """
 
-from __future__ import annotations
-
-import argparse
 import os
 import sys
 import time
-from collections.abc import Iterator
 from contextlib import ExitStack
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -25,6 +20,7 @@ sys.path[:0] = [str(ROOT / "tests"), str(ROOT / "src" / "wheretolook_ros")]
 
 import rclpy
 from bench_ros_paths import waypoints_of
+from common import options as parse_options
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from nav_msgs.msg import Path as PathMessage
@@ -33,7 +29,7 @@ from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import Writer
 from rosbags.typesys import Stores, get_typestore
 from sensor_msgs.msg import Image
-from wheretolook_ros.conversions import Array, pose_matrix, pose_message
+from wheretolook_ros.conversions import pose_matrix, pose_message
 
 from ros.processes import HEAD, Robot, base_at, environment, running
 from wheretolook.scenes.loading import load_mesh
@@ -53,7 +49,7 @@ DRIVE_S = 120.0
 FRAME_MS = 350
 
 
-def record(mesh: Path, folder: Path, bag: Path, min_length_m: float, seed: int) -> None:
+def record(mesh, folder, bag, min_length_m, seed):
     """Run robot, localizer and gaze node along a path, and write the bag."""
     with np.load(folder / "landmarks.npz") as stored:
         places = stored["places"]
@@ -71,7 +67,7 @@ def record(mesh: Path, folder: Path, bag: Path, min_length_m: float, seed: int) 
             name = f"{kind.__module__.split('.')[0]}/msg/{kind.__name__}"
             connection = writer.add_connection("/" + topic.strip("/"), name, typestore=STORE)
 
-            def keep(message: Any, connection: Any = connection, topic: str = topic) -> None:
+            def keep(message, connection=connection, topic=topic):
                 writer.write(connection, time.time_ns(), serialize_message(message))
                 node.received.append((f"kept {topic}", message if topic != "image" else None))
 
@@ -93,7 +89,7 @@ def record(mesh: Path, folder: Path, bag: Path, min_length_m: float, seed: int) 
         node.send("plan", path, time.time())
         goal = route[-2, :2]
 
-        def arrived() -> bool:
+        def arrived():
             truths = [message for name, message in node.received if name == "kept ground_truth"]
             return bool(truths) and np.linalg.norm(pose_matrix(truths[-1].pose)[:2, 3] - goal) < 0.3
 
@@ -101,13 +97,13 @@ def record(mesh: Path, folder: Path, bag: Path, min_length_m: float, seed: int) 
     rclpy.try_shutdown()
 
 
-def _spin(node: Robot, done: Any, seconds: float) -> None:
+def _spin(node, done, seconds):
     end = time.monotonic() + seconds
     while time.monotonic() < end and not done():
         rclpy.spin_once(node, timeout_sec=0.05)
 
 
-def frames_of(bag: Path, folder: Path) -> Iterator[Array]:
+def frames_of(bag, folder):
     """Draw a frame for each image of a bag: the image, and the plan with true and published poses."""
     import matplotlib.pyplot as plt
 
@@ -116,13 +112,13 @@ def frames_of(bag: Path, folder: Path) -> Iterator[Array]:
     low, high = np.quantile(points, (0.005, 0.995), axis=0)
     points = points[((points >= low) & (points <= high)).all(axis=1)]
     route = np.zeros((0, 2))
-    published: list[tuple[Array, int]] = []
-    travelled: list[Array] = []
+    published = []
+    travelled = []
     truth = np.eye(3, 4)
     status = ""
     with AnyReader([bag], default_typestore=STORE) as reader:
         for connection, stamp, raw in reader.messages():
-            message: Any = reader.deserialize(raw, connection.msgtype)
+            message = reader.deserialize(raw, connection.msgtype)
             if connection.topic == "/plan":
                 route = np.array([(pose.pose.position.x, pose.pose.position.y) for pose in message.poses])
             elif connection.topic == "/visual_localization/pose":
@@ -155,15 +151,8 @@ def frames_of(bag: Path, folder: Path) -> Iterator[Array]:
                 plt.close(figure)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--mesh", type=Path, required=True)
-    parser.add_argument("--folder", type=Path, required=True)
-    parser.add_argument("--bag", type=Path, required=True)
-    parser.add_argument("--film", type=Path, required=True)
-    parser.add_argument("--min-length", type=float, default=5.0, help="distance of start and goal in metres")
-    parser.add_argument("--seed", type=int, default=0)
-    options = parser.parse_args()
+def main():
+    options = parse_options(__doc__, mesh=..., folder=..., bag=..., film=..., min_length=5.0, seed=0)
     if not options.bag.exists():
         record(options.mesh, options.folder, options.bag, options.min_length, options.seed)
     save_moving(frames_of(options.bag, options.folder), FRAME_MS, options.film, 2000)

@@ -7,9 +7,6 @@ Times are CPU times of the node's process, whatever else runs on the machine. Wi
 every tenth is black, and the node publishes next views, so that all it does can keep memory.
 """
 
-from __future__ import annotations
-
-import argparse
 import os
 import sys
 import time
@@ -22,6 +19,7 @@ sys.path[:0] = [str(ROOT / "tests"), str(ROOT / "src" / "wheretolook_ros")]
 
 import rclpy
 from bench_ros import random_bases
+from common import options as parse_options
 from nav_msgs.msg import Odometry
 from sensor_msgs.msg import JointState
 from wheretolook_ros.conversions import pose_message
@@ -33,32 +31,26 @@ from wheretolook.scenes.loading import load_mesh
 TICKS = os.sysconf("SC_CLK_TCK")
 
 
-def cpu_seconds(pid: int) -> float:
+def cpu_seconds(pid):
     """CPU time of all threads of a process."""
     fields = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
     return (int(fields[11]) + int(fields[12])) / TICKS
 
 
-def resident_mb(pid: int) -> float:
+def resident_mb(pid):
     """Resident memory of a process."""
     return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
 
 
-def seconds_of_images(node: Robot) -> list[float]:
+def seconds_of_images(node):
     """Seconds that each localized image took, by the diagnostics received."""
     reports = [message.status[0].values for name, message in node.received if name == "/diagnostics"]
     return [float(pair.value) for values in reports for pair in values if pair.key == "seconds" and len(values) > 1]
 
 
-def main() -> None:
+def main():
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--mesh", type=Path, required=True)
-    parser.add_argument("--folder", type=Path, required=True)
-    parser.add_argument("--seconds", type=float, default=180)
-    parser.add_argument("--views", type=int, default=40)
-    parser.add_argument("--rate", type=float, default=0, help="images per second; 0: as fast as it localizes them")
-    options = parser.parse_args()
+    options = parse_options(__doc__, mesh=..., folder=..., seconds=180.0, views=40, rate=0.0)
     os.environ.update(environment())
     node_settings = {"folder": options.folder, "next_look": str(options.rate > 0).lower()}
     bases = random_bases(options.mesh, options.folder, options.views, 1)
@@ -75,7 +67,7 @@ def main() -> None:
         started = time.monotonic() - began
         print(f"first image localized {started:.1f} s after the start, {cpu_seconds(process.pid):.1f} s of CPU time")
         node.received.clear()
-        times: list[float] = []
+        times = []
         begin = time.monotonic()
         cpu = cpu_seconds(process.pid)
         number = 0

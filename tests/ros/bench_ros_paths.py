@@ -8,9 +8,6 @@ planning (`wheretolook_robot.RobotScorer`, `best_sequence`). Prints the share of
 the right ones.
 """
 
-from __future__ import annotations
-
-import argparse
 import sys
 from pathlib import Path
 
@@ -18,11 +15,14 @@ import numpy as np
 import pandas as pd
 
 ROOT = Path(__file__).parents[2]
-sys.path[:0] = [str(ROOT / "tests"), str(ROOT / "src" / "wheretolook_ros")]
+sys.path[:0] = [str(ROOT / "tests"), str(ROOT / "tests" / "benchmarks"), str(ROOT / "src" / "wheretolook_ros")]
+
+from common import options as parse_options
+from common import write_csv
 
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.camera_turns import pan_tilt_angles
-from wheretolook.geometry.poses import Float, pose_error, poses_looking_along
+from wheretolook.geometry.poses import pose_error, poses_looking_along
 from wheretolook.planning.config import PathConfig
 from wheretolook.planning.rrt import plan_path
 from wheretolook.planning.view_sequence import TurnLimit, best_sequence
@@ -40,7 +40,7 @@ MAX_TILT_DEG = 45.0
 MAX_TURN_DEG = 60.0
 
 
-def waypoints_of(places: Float, space: FreeSpace, min_length_m: float, rng: np.random.Generator) -> Float:
+def waypoints_of(places, space, min_length_m, rng):
     """Plan a shortest path between two random places (L, 3) m apart, and return points (W, 3) every `SPACING_M`."""
     bounds = np.stack([places.min(0), places.max(0)])
     while True:
@@ -57,15 +57,8 @@ def waypoints_of(places: Float, space: FreeSpace, min_length_m: float, rng: np.r
         return np.stack([np.interp(at, along, values) for values in path.positions.T], axis=1)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--mesh", type=Path, required=True)
-    parser.add_argument("--folder", type=Path, required=True)
-    parser.add_argument("--paths", type=int, default=20)
-    parser.add_argument("--min-length", type=float, default=3.0, help="distance of start and goal in metres")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--out", type=Path, default=Path("paths.csv"))
-    args = parser.parse_args()
+def main():
+    args = parse_options(__doc__, mesh=..., folder=..., paths=20, min_length=3.0, seed=0, out=Path("paths.csv"))
     mesh = load_mesh(args.mesh)
     space = FreeSpace(mesh)
     renderer = WarpRenderer(mesh)
@@ -93,7 +86,7 @@ def main() -> None:
                 rows.append((number, policy, k, probability, float(error[0]), float(error[1])))
         print(f"path {number + 1}: {len(points)} waypoints", flush=True)
     table = pd.DataFrame(rows, columns=["path", "policy", "waypoint", "probability", "error_m", "error_deg"])
-    table.to_csv(args.out, index=False, float_format="%.6g")
+    write_csv(table, args.out)
     table["confident"] = table["probability"] >= CONFIDENCE
     table["right"] = (table["error_m"] <= LIMITS[0]) & (table["error_deg"] <= LIMITS[1])
     for policy, part in table.groupby("policy"):

@@ -1,7 +1,5 @@
 """A textured room, and the robot's folder of its map: landmarks on what six square images see of it, without overlap."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2
@@ -12,8 +10,7 @@ from wheretolook import load_scorer
 from wheretolook.features.extractor import quantize_descriptors
 from wheretolook.features.opencv_sift import RootSift
 from wheretolook.geometry.camera import PinholeCamera
-from wheretolook.geometry.mesh import TexturedMesh
-from wheretolook.geometry.poses import Float, poses_looking_along
+from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.looks.next_look import mean_scores_by_pitch
 from wheretolook.mapping.landmarks import Landmarks
@@ -28,7 +25,7 @@ CUBE = PinholeCamera(640, 640, 320.0)
 REC_709 = (0.2126, 0.7152, 0.0722)
 
 
-def room_mesh() -> TexturedMesh:
+def room_mesh():
     """A room of 6 x 5 x 3 m with another texture on each side."""
     rng = np.random.default_rng(3)
     textures = []
@@ -38,7 +35,7 @@ def room_mesh() -> TexturedMesh:
     return quads_mesh(box_quads((0, 0, 0), (6, 5, 3), inward=True), textures)
 
 
-def room_landmarks(mesh: TexturedMesh) -> Landmarks:
+def room_landmarks(mesh):
     """Keypoints of the six images as landmarks at their depth."""
     poses = poses_looking_along(np.tile(CENTER, (6, 1)), DIRECTIONS)
     rendered = WarpRenderer(mesh).render(CUBE, poses)
@@ -72,7 +69,7 @@ def room_landmarks(mesh: TexturedMesh) -> Landmarks:
     )
 
 
-def write_folder(mesh: TexturedMesh, folder: Path, places: Float | None = None) -> Path:
+def write_folder(mesh, folder, places=None):
     """Export the robot's folder, with the occlusion at places (L, 3) m."""
     landmarks = room_landmarks(mesh)
     source = LocalizationMap(Map(landmarks), PinholeCamera())

@@ -6,10 +6,6 @@ It takes `place` (PoseStamped: where the base is), `joint_trajectory` and `plan`
 `image`, `camera_info`, `odom`, `joint_states`, and `ground_truth`, the true pose of the camera for each image.
 """
 
-from __future__ import annotations
-
-from typing import Any
-
 import numpy as np
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry, Path
@@ -18,15 +14,16 @@ from rclpy.time import Time
 from rosgraph_msgs.msg import Clock as ClockMessage
 from sensor_msgs.msg import CameraInfo, Image, JointState
 from trajectory_msgs.msg import JointTrajectory
-from wheretolook_ros.conversions import Array, pose_matrix, pose_message
+from wheretolook_ros.conversions import pose_matrix, pose_message
 from wheretolook_ros.node import RobotNode, run
 
+from ros.processes import info_of
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import compose_poses, invert_poses
 from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.scenes.loading import load_mesh
 
-PARAMETERS: dict[str, Any] = {
+PARAMETERS = {
     "mesh": "scene.glb",
     "rate_hz": 4.0,  # of images, while the head is at rest
     "images_while_turning": False,
@@ -42,14 +39,14 @@ TICK_S = 1 / 30
 class SimulatedRobot(RobotNode):
     """Renders, moves and measures itself thirty times a second."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         super().__init__("simulated_robot")
         for known in self.declare_parameters("", list(PARAMETERS.items())):
             setattr(self.settings, known.name, known.value)
         self.camera = PinholeCamera()
         self._renderer = WarpRenderer(load_mesh(self.settings.mesh))
         self._rng = np.random.default_rng(self.settings.seed)
-        self._base: Array | None = None  # in the map
+        self._base = None  # in the map
         self._odometry = np.eye(3, 4)
         self._joints = np.zeros(2)
         self._target = np.zeros(2)
@@ -67,7 +64,7 @@ class SimulatedRobot(RobotNode):
         self.create_subscription(Path, "plan", self._on_plan, 10)
         self.create_timer(TICK_S, self._tick, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
-    def _on_place(self, message: PoseStamped) -> None:
+    def _on_place(self, message):
         base = pose_matrix(message.pose)
         self._odometry = compose_poses(
             self._odometry, compose_poses(invert_poses(self._base), base) if self._base is not None else base
@@ -78,13 +75,13 @@ class SimulatedRobot(RobotNode):
         self._target = np.zeros(2)
         self._last_image = -np.inf
 
-    def _on_trajectory(self, message: JointTrajectory) -> None:
+    def _on_trajectory(self, message):
         self._target = np.array(message.points[-1].positions)
 
-    def _on_plan(self, message: Path) -> None:
+    def _on_plan(self, message):
         self._route = np.array([pose_matrix(pose.pose)[:2, 3] for pose in message.poses])
 
-    def _tick(self) -> None:
+    def _tick(self):
         if self._base is None:
             return
         self._time += TICK_S
@@ -110,7 +107,7 @@ class SimulatedRobot(RobotNode):
             self._last_image = self._time
             self._see(now)
 
-    def _drive(self) -> None:
+    def _drive(self):
         """Move along the route; odometry measures the step with its drift."""
         if len(self._route) == 0 or self._base is None:
             return
@@ -143,16 +140,11 @@ class SimulatedRobot(RobotNode):
         self._odometry = compose_poses(self._odometry, measured)
         self._base = base
 
-    def _see(self, now: Any) -> None:
+    def _see(self, now):
         assert self._base is not None
         map_from_camera = compose_poses(self._base, self.head.base_from_camera(*self._joints))
         rgb = self._renderer.render(self.camera, invert_poses(map_from_camera)[None]).rgb[0]
-        info = CameraInfo(width=self.camera.width, height=self.camera.height, distortion_model="plumb_bob")
-        matrix = self.camera.matrix
-        matrix[:2, 2] -= 0.5
-        info.k = matrix.ravel().tolist()
-        info.p = np.column_stack([matrix, np.zeros(3)]).ravel().tolist()
-        info.d = [0.0] * 5
+        info = info_of(self.camera)
         image = Image(height=rgb.shape[0], width=rgb.shape[1], encoding="rgb8", step=3 * rgb.shape[1])
         image.data = np.ascontiguousarray(rgb, dtype=np.uint8).tobytes()
         truth = PoseStamped(pose=pose_message(map_from_camera))

@@ -1,7 +1,5 @@
 """A simulated robot, the localizer and the gaze node, by a simulated clock: it looks until it is localized, then drives."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys
@@ -26,22 +24,22 @@ SIMULATOR = str(ROOT / "tests" / "ros" / "simulated_robot.py")
 
 
 @pytest.mark.slow  # four processes, half a minute
-def test_a_robot_that_faces_a_wall_turns_and_drives(tmp_path: Path) -> None:
+def test_a_robot_that_faces_a_wall_turns_and_drives(tmp_path):
     mesh = room_mesh()
     save_glb(mesh, tmp_path / "room.glb")
     folder = write_folder(mesh, tmp_path / "robot")
     os.environ.update(environment())
     rclpy.init()
     node = Robot()
-    truths: dict[float, np.ndarray] = {}
+    truths = {}
     place = node.create_publisher(PoseStamped, "place", 10)
 
-    def keep(message: PoseStamped) -> None:
+    def keep(message):
         truths[round(seconds(message.header.stamp), 4)] = pose_matrix(message.pose)
 
     node.create_subscription(PoseStamped, "ground_truth", keep, 50)
 
-    def errors() -> list[tuple[float, float]]:
+    def errors():
         """Errors of the published poses of the base, from the true ones of the camera and the joints."""
         found = []
         for name, message in node.received:
@@ -89,7 +87,7 @@ def test_a_robot_that_faces_a_wall_turns_and_drives(tmp_path: Path) -> None:
         ("ros_film", "--min-length 2 --bag {bag} --film {film}", ""),
     ],
 )
-def test_benchmarks_run_small(name: str, options: str, printed: str, tmp_path: Path) -> None:
+def test_benchmarks_run_small(name, options, printed, tmp_path):
     mesh = room_mesh()
     save_glb(mesh, tmp_path / "room.glb")
     x, y = np.meshgrid(np.arange(1.0, 6.0), np.arange(1.0, 4.0))

@@ -1,7 +1,6 @@
 """Every file of views holds the poses that were selected, in the frame that it says."""
 
 import json
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -10,26 +9,24 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from selection.room import POINTS
-from wheretolook.geometry.views import Views
 from wheretolook.select.waypoints import read_waypoints
-from wheretolook.select.where_to_look import WhereToLook
 from wheretolook.utils.errors import ConfigError, StorageError
 
 IDS = ("3", "1", "20", "7")
 
 
 @pytest.fixture(scope="module")
-def views(look: WhereToLook) -> Views:
+def views(look):
     return look.best(POINTS, ids=IDS)
 
 
-def poses_of(rotations: Rotation, centers: np.ndarray) -> np.ndarray:
+def poses_of(rotations, centers):
     """cam_from_world (B, 3, 4) of camera-to-world rotations and the centres of cameras (B, 3)."""
     turns = rotations.inv().as_matrix()
     return np.concatenate([turns, -turns @ centers[..., None]], axis=2)
 
 
-def test_csv(look: WhereToLook, tmp_path: Path) -> None:
+def test_csv(look, tmp_path):
     names = ("hall, north", 'the "attic"', "a b", "c")
     views = look.best(POINTS, ids=names)
     views.save(tmp_path / "views.csv")
@@ -52,7 +49,7 @@ def test_csv(look: WhereToLook, tmp_path: Path) -> None:
     assert np.loadtxt(tmp_path / "poses.txt", dtype=str)[2][0] == "a_b"
 
 
-def test_json(views: Views, tmp_path: Path) -> None:
+def test_json(views, tmp_path):
     views.save(tmp_path / "views.json")
     content = json.loads((tmp_path / "views.json").read_text())
     assert content["camera"] == {"model": "SIMPLE_PINHOLE", "width": 640, "height": 480, "params": [320, 320, 240]}
@@ -62,7 +59,7 @@ def test_json(views: Views, tmp_path: Path) -> None:
     np.testing.assert_array_equal([view["quaternion_xyzw"] for view in content["views"]], views.quaternions_xyzw)
 
 
-def test_tum(views: Views, tmp_path: Path) -> None:
+def test_tum(views, tmp_path):
     views.save(tmp_path / "views.tum")
     rows = np.loadtxt(tmp_path / "views.tum")
     np.testing.assert_array_equal(rows[:, 0], [3, 1, 20, 7])  # the waypoints' names are numbers
@@ -70,7 +67,7 @@ def test_tum(views: Views, tmp_path: Path) -> None:
     np.testing.assert_allclose(read_waypoints(tmp_path / "views.tum").points, POINTS, atol=1e-8)
 
 
-def test_benchmark(views: Views, tmp_path: Path) -> None:
+def test_benchmark(views, tmp_path):
     views.save(tmp_path / "selected_poses.txt", "benchmark")
     header, *lines = (tmp_path / "selected_poses.txt").read_text().splitlines()
     assert header == "# id qw qx qy qz tx ty tz" and tuple(line.split()[0] for line in lines) == IDS
@@ -80,7 +77,7 @@ def test_benchmark(views: Views, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("n", [1, 2])
-def test_colmap_reads_the_folder(look: WhereToLook, n: int, tmp_path: Path) -> None:
+def test_colmap_reads_the_folder(look, n, tmp_path):
     views = look.best(POINTS, n)
     views.save(tmp_path / "model")
     views.save(tmp_path / "model")  # again over its own
@@ -92,13 +89,17 @@ def test_colmap_reads_the_folder(look: WhereToLook, n: int, tmp_path: Path) -> N
     assert list(model.cameras[1].params) == [320, 320, 240]
 
 
-def test_invalid_targets_are_rejected(views: Views, look: WhereToLook, sparse: Path, tmp_path: Path) -> None:
-    for target in ((tmp_path / "views.txt",), (tmp_path / "views.csv", "xml"), (sparse,), (tmp_path, "csv")):
-        with pytest.raises(ConfigError):
-            views.save(*target)
-    for form in ("tum", "benchmark"):
-        with pytest.raises(ConfigError):
-            look.best(POINTS, 2).save(tmp_path / "views", form)
+def test_invalid_targets_are_rejected(views, look, sparse, tmp_path):
     (tmp_path / "file").write_text("")
-    with pytest.raises(StorageError):
-        views.save(tmp_path / "file" / "views.csv")
+    twice = look.best(POINTS, 2)
+    for chosen, target, error in (
+        (views, (tmp_path / "views.txt",), ConfigError),
+        (views, (tmp_path / "views.csv", "xml"), ConfigError),
+        (views, (sparse,), ConfigError),
+        (views, (tmp_path, "csv"), ConfigError),
+        (twice, (tmp_path / "views", "tum"), ConfigError),
+        (twice, (tmp_path / "views", "benchmark"), ConfigError),
+        (views, (tmp_path / "file" / "views.csv",), StorageError),
+    ):
+        with pytest.raises(error):
+            chosen.save(*target)

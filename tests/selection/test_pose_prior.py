@@ -1,29 +1,25 @@
 """Expected scores where the robot's pose is uncertain."""
 
-from __future__ import annotations
-
-from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from selection.room import POINTS
-from wheretolook.select.where_to_look import PoseUncertainty, WhereToLook
+from wheretolook.select.where_to_look import PoseUncertainty
 
 FREE_TO_X = 5.0  # beyond is geometry
 
 
-def expected(prior: PoseUncertainty, score: Any) -> tuple[np.ndarray, np.ndarray]:
+def expected(prior, score):
     """Compute expected scores of a view along x at the origin, where only the direction y is allowed."""
     occlusion = SimpleNamespace(inside_geometry=lambda points: points[:, 0] > FREE_TO_X)
-    scorer: Any = SimpleNamespace(score_directions=score, localization_map=SimpleNamespace(occlusion=occlusion))
+    scorer = SimpleNamespace(score_directions=score, localization_map=SimpleNamespace(occlusion=occlusion))
     chosen = np.array([0]), np.array([[1.0, 0.0, 0.0]])
     return prior.expected_scores(scorer, np.zeros((1, 3)), np.array([[0.0, 1.0, 0.0]]), np.ones((1, 1), bool), chosen)
 
 
-def test_means_of_known_scores() -> None:
+def test_means_of_known_scores():
     along_x = expected(PoseUncertainty(0.0, 45.0), lambda points, axes: axes[None, :, 0])
     np.testing.assert_allclose(along_x[0], np.exp(-(np.radians(45) ** 2) / 2), atol=0.12)  # E cos of a normal angle
     squared = expected(
@@ -38,7 +34,7 @@ def test_means_of_known_scores() -> None:
     np.testing.assert_allclose(sideways, [[0.0], [1.0]])
 
 
-def test_views_report_expected_scores(look: WhereToLook, tmp_path: Path) -> None:
+def test_views_report_expected_scores(look, tmp_path):
     plain, uncertain = look.best(POINTS, 2), look.best(POINTS, 2, sigma_m=0.5, yaw_sigma_deg=5)
     assert plain.expected_score is None
     np.testing.assert_array_equal(uncertain.cam_from_world, plain.cam_from_world)

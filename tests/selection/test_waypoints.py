@@ -1,7 +1,5 @@
 """Waypoints are read from every usual format, and invalid files are rejected."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -29,7 +27,7 @@ AT = [[1.5, -2.0, 0.25], [0.0, 3.0, 1.0]]
     ],
     ids=["csv", "csv-with-id", "csv-without-header", "semicolons", "decimal-commas", "benchmark", "plain", "tum"],
 )
-def test_formats(text: str, ids: tuple[str, ...], lines: tuple[int, ...], tmp_path: Path) -> None:
+def test_formats(text, ids, lines, tmp_path):
     path = tmp_path / "waypoints"
     path.write_text(text, encoding="utf-8")
     found = read_waypoints(path)
@@ -54,14 +52,14 @@ def test_formats(text: str, ids: tuple[str, ...], lines: tuple[int, ...], tmp_pa
         'id,x,y,z\n"a\nb",1,2,3\n',
     ],
 )
-def test_invalid_files_are_rejected(text: str, tmp_path: Path) -> None:
+def test_invalid_files_are_rejected(text, tmp_path):
     path = tmp_path / "waypoints.csv"
     path.write_text(text)
     with pytest.raises(TableError):
         read_waypoints(path)
 
 
-def test_a_zero_quaternion_is_no_heading(tmp_path: Path) -> None:
+def test_a_zero_quaternion_is_no_heading(tmp_path):
     path = tmp_path / "path.tum"
     path.write_text("0 1 2 3 0 0 0 1\n1 1 2 3 0 0 0 0\n")
     assert read_waypoints(path).points.tolist() == [[1, 2, 3]] * 2
@@ -69,7 +67,7 @@ def test_a_zero_quaternion_is_no_heading(tmp_path: Path) -> None:
         read_waypoints(path).heading_deg(np.eye(3))
 
 
-def test_points_from_text_and_arrays() -> None:
+def test_points_from_text_and_arrays():
     np.testing.assert_array_equal(parse_points(["1.5,-2,.25", " 0,3,1"]).points, AT)
     assert Waypoints.of([1, 2, 3]).points.shape == (1, 3)
     assert Waypoints.of(AT, ("a", "b"))[np.array([False, True])].ids == ("b",)

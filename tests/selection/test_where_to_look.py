@@ -1,11 +1,10 @@
 """The views that are selected are the best ones, of all directions, within the limits."""
 
-from __future__ import annotations
-
 from itertools import pairwise, product
-from pathlib import Path
 
+import cv2
 import numpy as np
+import pycolmap
 import pytest
 
 from box_scenes import furnished_room
@@ -17,28 +16,28 @@ from wheretolook.geometry.lattices import direction_lattice
 from wheretolook.geometry.pose_files import images_text, tum_text
 from wheretolook.geometry.poses import rotation_angle_deg, rotation_looking_along
 from wheretolook.mapping.depth_images import read_depth_images
+from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.scenes.loading import save_glb
-from wheretolook.scorers.base import Scorer
 from wheretolook.select.waypoints import SelectionRequest, read_waypoints
 from wheretolook.select.where_to_look import WhereToLook
-from wheretolook.utils.errors import ConfigError, MapError, SceneError, TableError, WeightsError, WhereToLookError
+from wheretolook.utils.errors import ConfigError, MapError, SceneError, TableError, WeightsError
 from wheretolook.visibility.hidden_points import HiddenPointRemoval
 
 AXES = direction_lattice(60)
 
 
 @pytest.fixture(scope="module")
-def scorer(sparse: Path) -> Scorer:
+def scorer(sparse):
     """The way to score without the façade."""
     return load_scorer(LocalizationMap.from_colmap(sparse, occlusion=HiddenPointRemoval()), WEIGHTS)
 
 
-def all_scores(scorer: Scorer, points: np.ndarray) -> np.ndarray:
+def all_scores(scorer, points):
     poses = poses_looking_along(np.repeat(points, len(AXES), axis=0), np.tile(AXES, (len(points), 1)))
     return scorer.score(poses).reshape(len(points), len(AXES))
 
 
-def test_best_views_are_those_of_the_scorer(look: WhereToLook, scorer: Scorer) -> None:
+def test_best_views_are_those_of_the_scorer(look, scorer):
     scores = all_scores(scorer, POINTS)
     views = look.best(POINTS, 3)
     assert Exported is WhereToLook
@@ -55,7 +54,7 @@ def test_best_views_are_those_of_the_scorer(look: WhereToLook, scorer: Scorer) -
 
 
 @pytest.mark.parametrize("camera", [None, ColmapCamera("SIMPLE_RADIAL", 640, 480, (320.0, 320.0, 240.0, 0.05))])
-def test_all_directions_at_once_score_as_one_by_one(camera: ColmapCamera | None, tmp_path: Path) -> None:
+def test_all_directions_at_once_score_as_one_by_one(camera, tmp_path):
     folder = write_room(tmp_path / "sparse", text=camera is None)
     localization_map = LocalizationMap.from_colmap(folder, camera, occlusion=HiddenPointRemoval())
     scorer = load_scorer(localization_map, WEIGHTS)
@@ -66,7 +65,7 @@ def test_all_directions_at_once_score_as_one_by_one(camera: ColmapCamera | None,
     np.testing.assert_allclose(odds[0], odds[1], atol=0.02)
 
 
-def test_a_sample_of_the_landmarks_ranks_as_all(tmp_path: Path) -> None:
+def test_a_sample_of_the_landmarks_ranks_as_all(tmp_path):
     localization_map = LocalizationMap.from_colmap(write_room(tmp_path / "sparse", n=6000))
     scorer = load_scorer(localization_map, WEIGHTS)
     poses = poses_looking_along(np.repeat(POINTS, len(AXES), axis=0), np.tile(AXES, (len(POINTS), 1)))
@@ -79,7 +78,7 @@ def test_a_sample_of_the_landmarks_ranks_as_all(tmp_path: Path) -> None:
     assert (slow.max(axis=1) - slow[rows, fast.argmax(axis=1)] < 0.01).all()
 
 
-def test_the_sequence_is_the_best_of_all(sparse: Path) -> None:
+def test_the_sequence_is_the_best_of_all(sparse):
     look = WhereToLook.from_colmap(sparse, weights=WEIGHTS, directions=12, device="cpu")
     axes = look.directions
     limit = 60.0
@@ -98,13 +97,7 @@ def test_the_sequence_is_the_best_of_all(sparse: Path) -> None:
     assert (turned <= limit + 1e-4).all()
 
 
-def test_limits_on_pitch(look: WhereToLook) -> None:
-    views = look.best(POINTS, 5, pitch_deg=(-20, 10))
-    assert (views.pitch_deg >= -20).all() and (views.pitch_deg <= 10).all()
-    assert len(views) == 20 and len({tuple(axis) for axis in views.axes[:5].round(6)}) == 5
-
-
-def test_waypoints_outside_the_map(look: WhereToLook) -> None:
+def test_waypoints_outside_the_map(look):
     given = np.concatenate([POINTS[:2], [[300.0, 2.0, 1.5]], POINTS[2:]])
     with pytest.raises(TableError):
         look.best(given)
@@ -117,9 +110,7 @@ def test_waypoints_outside_the_map(look: WhereToLook) -> None:
         look.best(look.localization_map.landmarks.points[3])
 
 
-def test_a_mesh_hides_landmarks_and_holds_waypoints_inside_geometry(
-    look: WhereToLook, sparse: Path, tmp_path: Path
-) -> None:
+def test_a_mesh_hides_landmarks_and_holds_waypoints_inside_geometry(look, sparse, tmp_path):
     save_glb(furnished_room(), tmp_path / "room.glb")
     open_room = WhereToLook.from_colmap(sparse, weights=WEIGHTS, directions=60, occlusion="none", device="cpu")
     room = WhereToLook.from_colmap(sparse, weights=WEIGHTS, directions=60, mesh=tmp_path / "room.glb", device="cpu")
@@ -138,32 +129,23 @@ def test_a_mesh_hides_landmarks_and_holds_waypoints_inside_geometry(
         assert len(grid) > 5 and finder.space.is_free(grid.points).all()
 
 
-def test_depth_images(sparse: Path, tmp_path: Path) -> None:
-    import cv2
-    import pycolmap
-
-    from wheretolook.rendering.warp_renderer import WarpRenderer
-
+def test_depth_images(sparse, tmp_path):
     model = pycolmap.Reconstruction(sparse)
-    folder = tmp_path / "depth"
-    folder.mkdir()
     renderer = WarpRenderer(furnished_room(), "cpu")
-    half = PinholeCamera(320, 240, 160.0)
+    (tmp_path / "depth").mkdir()
     for image in model.images.values():
-        depth = renderer.render(half, image.cam_from_world().matrix()[None]).depth_m[0]
+        pose = image.cam_from_world().matrix()[None]
+        depth = renderer.render(PinholeCamera(320, 240, 160.0), pose).depth_m[0]
         millimetres = np.nan_to_num(depth, nan=0, posinf=0) * 1000
-        cv2.imwrite(str(folder / image.name.replace(".jpg", ".png")), millimetres.astype(np.uint16))
-    look = WhereToLook.from_colmap(sparse, weights=WEIGHTS, directions=60, depth=folder, device="cpu")
+        cv2.imwrite(str(tmp_path / "depth" / f"{image.name[:-4]}.png"), millimetres.astype(np.uint16))
+    look = WhereToLook.from_colmap(sparse, weights=WEIGHTS, directions=60, depth=tmp_path / "depth", device="cpu")
     assert look.localization_map.occlusion.name == "tsdf" and len(look.best(POINTS)) == 4
     with pytest.raises(SceneError):
         WhereToLook.from_colmap(sparse, weights=WEIGHTS, depth=tmp_path, device="cpu")
 
 
-def test_depth_images_of_a_camera_with_distortion(tmp_path: Path) -> None:
+def test_depth_images_of_a_camera_with_distortion(tmp_path):
     """A wall at 2 m and x > 0.8 m, in images twice as large as their depth images; colours are next to the depths."""
-    import cv2
-    import pycolmap
-
     lens = pycolmap.Camera(model="SIMPLE_RADIAL", width=400, height=300, params=[300, 200, 150, -0.2], camera_id=1)
     model = pycolmap.Reconstruction()
     model.add_camera_with_trivial_rig(lens)
@@ -182,8 +164,8 @@ def test_depth_images_of_a_camera_with_distortion(tmp_path: Path) -> None:
     assert points[:, 0].min() == pytest.approx(0.8, abs=2 / 150)
 
 
-def test_cameras(sparse: Path) -> None:
-    def camera(**options: object) -> object:
+def test_cameras(sparse):
+    def camera(**options):
         return WhereToLook.from_colmap(
             sparse, weights=WEIGHTS, occlusion="none", device="cpu", **options
         ).localization_map.camera
@@ -197,51 +179,39 @@ def test_cameras(sparse: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "error"),
     [
-        *[
-            ({"camera": text}, ConfigError)
-            for text in ("PINHOLE,640,480", "PINHOLE,640,480,nan,320,320,240", "MAGIC,640,480,320", "")
-        ],
-        ({"camera": 7}, MapError),
-        ({"fov_deg": 180}, ConfigError),
-        ({"fov_deg": 1.2}, ConfigError),
-        ({"fov_deg": 60, "camera": 1}, ConfigError),
-        ({"method": "nothing"}, ConfigError),
-        ({"weights": "nothing.safetensors"}, WeightsError),
-        ({"method": "mlp-2d", "weights": WEIGHTS}, WeightsError),
-        ({"mesh": "nothing.glb"}, SceneError),
-        ({"depth": "nothing"}, SceneError),
-        ({"occlusion": "mesh"}, ConfigError),
-        ({"lattice": "square"}, ConfigError),
-        ({"directions": 0}, ConfigError),
-        ({"max_reprojection_error_px": -1}, ConfigError),
+        ({"camera": "PINHOLE,640,480"}, ConfigError), ({"camera": "PINHOLE,640,480,nan,320,320,240"}, ConfigError),
+        ({"camera": "MAGIC,640,480,320"}, ConfigError), ({"camera": ""}, ConfigError), ({"camera": 7}, MapError),
+        ({"fov_deg": 180}, ConfigError), ({"fov_deg": 1.2}, ConfigError), ({"fov_deg": 60, "camera": 1}, ConfigError),
+        ({"method": "nothing"}, ConfigError), ({"method": "mlp-2d", "weights": WEIGHTS}, WeightsError),
+        ({"weights": "nothing.safetensors"}, WeightsError), ({"mesh": "nothing.glb"}, SceneError),
+        ({"depth": "nothing"}, SceneError), ({"occlusion": "mesh"}, ConfigError), ({"lattice": "square"}, ConfigError),
+        ({"directions": 0}, ConfigError), ({"max_reprojection_error_px": -1}, ConfigError),
         ({"device": "tpu"}, ConfigError),
     ],
-)
-def test_invalid_options_are_rejected(sparse: Path, options: dict, error: type[WhereToLookError]) -> None:
+)  # fmt: skip
+def test_invalid_options_are_rejected(sparse, options, error):
     with pytest.raises(error):
         WhereToLook.from_colmap(sparse, **{"weights": WEIGHTS, "device": "cpu", **options})
 
 
-def test_looks_chosen_together_score_more_than_one(look: WhereToLook, tmp_path: Path) -> None:
+def test_looks_chosen_together_score_more_than_one(look, tmp_path):
     one = look.best(POINTS, looks=1)
     three = look.best(POINTS, looks=3)
-    assert len(three) == 12 and three.set_score is not None and one.set_score is not None
     np.testing.assert_allclose(one.axes, look.best(POINTS).axes, atol=1e-9)
     np.testing.assert_array_equal(three.rank, np.tile([1, 2, 3], 4))
     sets = three.set_score.reshape(4, 3)
     assert (np.ptp(sets, axis=1) == 0).all() and (sets[:, 0] > one.set_score).all()
     np.testing.assert_allclose(three.positions, np.repeat(POINTS, 3, axis=0), atol=1e-9)
-    near = look.best(POINTS, looks=3, max_total_turn_deg=90, pitch_deg=(-40, 40))
+    near = look.best(POINTS, looks=3, max_total_turn_deg=90, pitch_deg=(-40, 20))
     rotations = near.cam_from_world.reshape(4, 3, 3, 4)[..., :3]
-    turned = rotation_angle_deg(rotations[:, :-1], rotations[:, 1:]).sum(1)
-    assert (turned <= 90 + 1e-4).all() and (np.abs(near.pitch_deg) <= 40 + 1e-6).all()
-    three.save(tmp_path / "looks.csv")
-    assert "set_score" in (tmp_path / "looks.csv").read_text().splitlines()[0]
-    look.best(POINTS).save(tmp_path / "views.csv")
-    assert "set_score" not in (tmp_path / "views.csv").read_text()
+    assert (rotation_angle_deg(rotations[:, :-1], rotations[:, 1:]).sum(1) <= 90 + 1e-4).all()
+    assert near.pitch_deg.min() >= -40 - 1e-6 and near.pitch_deg.max() <= 20 + 1e-6
+    for views, written in ((three, True), (look.best(POINTS), False)):
+        views.save(tmp_path / "views.csv")
+        assert ("set_score" in (tmp_path / "views.csv").read_text()) == written
 
 
-def test_a_sequence_stops_where_one_look_will_not_do(look: WhereToLook, tmp_path: Path) -> None:
+def test_a_sequence_stops_where_one_look_will_not_do(look, tmp_path):
     sequence = look.best(POINTS, max_turn_deg=10)
     asked = float(np.median(sequence.score))
     views = look.best(POINTS, max_turn_deg=10, looks=3, least_score=asked)
@@ -249,56 +219,36 @@ def test_a_sequence_stops_where_one_look_will_not_do(look: WhereToLook, tmp_path
     np.testing.assert_array_equal(views.cam_from_world[own], sequence.cam_from_world)
     stops = {*views.waypoint[~own].tolist()}
     assert stops and stops <= {*np.flatnonzero(sequence.score < asked).tolist()}
-    assert views.set_score is not None
-    for place in range(len(POINTS)):
+    for place, score in enumerate(sequence.score):
         rows = views.waypoint == place
-        assert views.rank[rows].tolist() == list(range(1, 1 + rows.sum())) and len({*views.set_score[rows]}) == 1
-        np.testing.assert_allclose(views.positions[rows], np.tile(POINTS[place], (rows.sum(), 1)), atol=1e-9)
-        if place in stops:
-            assert views.set_score[rows][0] > sequence.score[place]
-        else:
-            assert views.set_score[rows][0] == pytest.approx(sequence.score[place], rel=1e-5)
+        assert views.rank[rows].tolist() == list(range(1, 1 + rows.sum())) and np.ptp(views.set_score[rows]) == 0
+        np.testing.assert_allclose(views.positions[rows] - POINTS[place], 0, atol=1e-9)
+        together = views.set_score[rows][0]
+        assert together > score if place in stops else together == pytest.approx(score, rel=1e-5)
     views.save(tmp_path / "views.csv")
     with pytest.raises(ConfigError):
         views.save(tmp_path / "views.tum")
 
 
-def test_a_turn_in_radians_is_rejected(look: WhereToLook) -> None:
-    with pytest.raises(ConfigError):
-        look.best(POINTS, max_turn_deg=0.5)
-    assert len({*map(tuple, look.best(POINTS, max_turn_deg=0).axes.round(6).tolist())}) == 1
-
-
 @pytest.mark.parametrize(
     "options",
     [
-        {"n": 0},
-        {"looks": 0},
-        {"n": 2, "looks": 2},
-        {"n": 2, "max_turn_deg": 30},
-        {"looks": 2, "max_turn_deg": 30},
+        {"n": 0}, {"looks": 0}, {"n": 2, "looks": 2}, {"n": 2, "max_turn_deg": 30}, {"looks": 2, "max_turn_deg": 30},
         {"max_total_turn_deg": 30},
-        {"pitch_deg": (30, -30)},
-        {"pitch_deg": 10},
-        {"pan_deg": (1, 2, 3)},
-        {"pan_deg": (30, -30)},
-        {"pan_deg": (-190, 200)},
-        {"apart_deg": 20},
-        {"n": 2, "apart_deg": -1},
-        {"n": 2, "apart_deg": float("nan")},
+        {"pitch_deg": (30, -30)}, {"pitch_deg": 10}, {"pitch_deg": (-100, 0)}, {"pitch_deg": (30, np.nan)},
         {"pitch_deg": (-0.5, 0.5)},  # radians
-        {"pitch_deg": (-100, 0)},
-        {"pitch_deg": (30, np.nan)},
+        {"pan_deg": (1, 2, 3)}, {"pan_deg": (30, -30)}, {"pan_deg": (-190, 200)},
+        {"apart_deg": 20}, {"n": 2, "apart_deg": -1}, {"n": 2, "apart_deg": float("nan")},
         {"looks": 3, "least_score": 0.5},
         {"looks": 3, "max_turn_deg": 10, "least_score": 0.5, "max_total_turn_deg": 90},
     ],
-)
-def test_invalid_requests_are_rejected(options: dict) -> None:
+)  # fmt: skip
+def test_invalid_requests_are_rejected(options):
     with pytest.raises(ConfigError):
         SelectionRequest(**options)
 
 
-def test_limits_on_pan_are_relative_to_the_heading(look: WhereToLook, tmp_path: Path) -> None:
+def test_limits_on_pan_are_relative_to_the_heading(look, tmp_path):
     heading = np.array([170.0, -90.0, 0.0, 45.0])
     half = np.radians(heading) / 2
     robot = np.column_stack([np.arange(4), POINTS, np.zeros((4, 2)), np.sin(half), np.cos(half)])  # x forward, z up
@@ -308,27 +258,29 @@ def test_limits_on_pan_are_relative_to_the_heading(look: WhereToLook, tmp_path: 
     (tmp_path / "images.txt").write_text(images_text("0123", cameras))
     table = np.column_stack([POINTS, heading])
     np.savetxt(tmp_path / "at.csv", table, delimiter=",", header="x,y,z,heading_deg", comments="")
+    every_turn = {"max_turn_deg": 360.0}
+    for limits, options in (
+        ((-20, 60), {"n": 3}),
+        ((-20, 60), {"looks": 3}),
+        ((-20, 60), every_turn),
+        ((-20, 60), every_turn | {"looks": 3, "least_score": 0.9999}),
+        ((150, 210), {}),
+    ):
+        views = look.best(POINTS, heading_deg=heading, pan_deg=limits, **options)
+        pan = (views.yaw_deg - heading[views.waypoint] - limits[0] + 1e-6) % 360
+        assert (pan <= limits[1] - limits[0] + 2e-6).all()
     views = look.best(POINTS, 3, heading_deg=heading, pan_deg=(-20, 60))
-    pan = (views.yaw_deg - np.repeat(heading, 3) + 180) % 360 - 180
-    assert (pan >= -20 - 1e-6).all() and (pan <= 60 + 1e-6).all()
     for name in ("robot.tum", "camera.tum", "images.txt", "at.csv"):
         same = look.best(read_waypoints(tmp_path / name), 3, pan_deg=(-20, 60))
         np.testing.assert_allclose(same.cam_from_world, views.cam_from_world, atol=1e-9)
-    for options in ({"looks": 3}, {"max_turn_deg": 360.0}, {"max_turn_deg": 360.0, "looks": 3, "least_score": 0.9999}):
-        other = look.best(POINTS, heading_deg=heading, pan_deg=(-20, 60), **options)
-        pan = (other.yaw_deg - heading[other.waypoint] + 180) % 360 - 180
-        assert (pan >= -20 - 1e-6).all() and (pan <= 60 + 1e-6).all()
-    for points, options in ((POINTS, {}), (POINTS, {"heading_deg": [0, np.nan, 0, 0]}), (POINTS, {"heading_deg": [0]})):
+    for options in ({}, {"heading_deg": [0, np.nan, 0, 0]}, {"heading_deg": [0]}):
         with pytest.raises(TableError):
-            look.best(points, pan_deg=(-20, 60), **options)
-    views = look.best(POINTS, heading_deg=heading, pan_deg=(150, 210))
-    back = (views.yaw_deg - heading) % 360
-    assert (back >= 150 - 1e-6).all() and (back <= 210 + 1e-6).all()
+            look.best(POINTS, pan_deg=(-20, 60), **options)
     with pytest.raises(ConfigError):
         look.best(POINTS, heading_deg=heading, pan_deg=(0, 0.01))
 
 
-def test_best_views_apart(look: WhereToLook) -> None:
+def test_best_views_apart(look):
     near = look.best(POINTS, 4)
     apart = look.best(POINTS, 4, apart_deg=50)
     np.testing.assert_allclose(apart.axes[::4], near.axes[::4], atol=1e-9)
@@ -338,3 +290,9 @@ def test_best_views_apart(look: WhereToLook) -> None:
     assert (np.diff(apart.score.reshape(4, 4)) <= 0).all()
     with pytest.raises(ConfigError, match="waypoint 0 has too few views"):
         look.best(POINTS, 4, apart_deg=170)
+
+
+def test_a_turn_in_radians_is_rejected(look):
+    with pytest.raises(ConfigError):
+        look.best(POINTS, max_turn_deg=0.5)
+    assert len({*map(tuple, look.best(POINTS, max_turn_deg=0).axes.round(6).tolist())}) == 1

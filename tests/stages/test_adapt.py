@@ -1,15 +1,12 @@
 """The adapt stage, from labels that are there to weights that score."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import numpy as np
 import pandas as pd
 import pytest
 
+from fixed_fields import main
+from stages.test_pipeline import EXPERIMENT
 from synthetic_dataset import make_dataset
-from wheretolook.cli import main
 from wheretolook.dataset.layout import Dataset
 from wheretolook.dataset.viewpoint_files import write_table
 from wheretolook.dataset.viewpoint_table import is_good, poses
@@ -21,7 +18,7 @@ from wheretolook.training.weights import read_training
 
 
 @pytest.fixture
-def dataset(tmp_path: Path) -> Dataset:
+def dataset(tmp_path):
     """Two labelled scenes of weak landmarks, of which the weights that ship expect other labels than they have."""
     dataset = make_dataset(tmp_path / "data" / "tiny", ("train", "test"))
     for scene in dataset.scenes:
@@ -29,14 +26,14 @@ def dataset(tmp_path: Path) -> Dataset:
     return dataset
 
 
-def run(dataset: Dataset, *options: str) -> int:
+def run(dataset, *options):
     root = dataset.root
     camera = ["--camera.width", "160", "--camera.height", "120", "--camera.focal_px", "80", "--camera.fov_deg", "null"]
     where = ["--name", root.name, "--data", str(root.parent), "--tracking.folder", str(root.parent / "mlruns")]
     return main(["adapt", *where, "--device", "cpu", *camera, *options])
 
 
-def test_adapted_weights_have_a_lower_loss_and_are_logged(dataset: Dataset, capsys: pytest.CaptureFixture[str]) -> None:
+def test_adapted_weights_have_a_lower_loss_and_are_logged(dataset, capsys):
     shards = dataset.scenes[1].adapt_shards / "000000"
     shards.mkdir(parents=True)  # of a run before these views had labels
     assert run(dataset, "--scene", "scene-1") == 0
@@ -59,7 +56,7 @@ def test_adapted_weights_have_a_lower_loss_and_are_logged(dataset: Dataset, caps
     assert one.data.metrics["better"] == 1.0
 
 
-def test_weights_without_a_gain_are_not_kept(dataset: Dataset, capsys: pytest.CaptureFixture[str]) -> None:
+def test_weights_without_a_gain_are_not_kept(dataset, capsys):
     scene = dataset.scenes[1]
     table = scene.read_table()
     scored = load_scorer(scene.localization_map(scene.camera)).score(poses(table))
@@ -90,16 +87,14 @@ def test_weights_without_a_gain_are_not_kept(dataset: Dataset, capsys: pytest.Ca
         ("--scene", "scene-1", "--label.changes", "0.5"),
     ],
 )
-def test_bad_input_is_named(
-    dataset: Dataset, options: tuple[str, ...], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_bad_input_is_named(dataset, options, capsys, monkeypatch):
     monkeypatch.chdir(dataset.root)
     (dataset.root / "dataset").write_text("")
     assert run(dataset, *options) == 2
     assert capsys.readouterr().err.startswith("wheretolook: error: ")
 
 
-def test_gains_are_those_of_known_cases() -> None:
+def test_gains_are_those_of_known_cases():
     """Two locations of two views: the first chooses wrongly before and rightly after."""
     good = np.array([True, False, True, False])
     before = np.array([-1.0, 1.0, 1.0, -1.0])
@@ -113,27 +108,18 @@ def test_gains_are_those_of_known_cases() -> None:
 
 
 @pytest.mark.slow
-def test_views_are_labelled_for_some_minutes_and_found_again(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_views_are_labelled_for_some_minutes_and_found_again(tmp_path, capsys):
     """From nothing: a small apartment is made, mapped and sampled; then adapt labels, stops, and goes on."""
-    settings = tmp_path / "small.yaml"
-    settings.write_text("""\
-name: small
-camera: {width: 320, height: 240, focal_px: 160}
-scenes:
-  train: 0
-  test: 1
-  apartment: {n_rooms: 3, area_m2: 26, texture_size: 1024, texels_per_m: 40, light_spacing_m: 0.5, light_rays: 4}
-mapping: {n_images: 24}
-sample: {grid: [6, 6, 4], directions: 100, keep: 50, max_locations: 40, max_directions: 8}
-label: {workers: 1, shard_size: 32}
-""")
+    settings = tmp_path / "tiny.yaml"
+    only_test = EXPERIMENT.replace("train: 1", "train: 0")
+    settings.write_text(
+        only_test.replace("max_locations: 8, max_directions: 5", "max_locations: 40, max_directions: 8")
+    )
     where = ["--config", str(settings), "--data", str(tmp_path / "data"), "--device", "cpu"]
     where += ["--tracking.folder", str(tmp_path / "mlruns")]
     for stage in ("scenes", "map", "sample"):
         assert main([stage, *where]) == 0
-    (scene,) = Dataset.load(tmp_path / "data" / "small").scenes
+    (scene,) = Dataset.load(tmp_path / "data" / "tiny").scenes
     n_views = len(scene.read_table())
     assert n_views > 128  # the clock is looked at after so many
     capsys.readouterr()

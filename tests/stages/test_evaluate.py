@@ -1,9 +1,8 @@
 """The evaluate stage on a tiny dataset whose labels follow a known rule."""
 
-from __future__ import annotations
-
 import shutil
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +14,6 @@ from learning_options import train_config
 from synthetic_dataset import make_dataset
 from wheretolook.commands.evaluate import evaluate_methods as evaluate
 from wheretolook.commands.train import train_methods as train
-from wheretolook.dataset.layout import Dataset
 from wheretolook.dataset.viewpoint_files import write_table
 from wheretolook.dataset.viewpoint_table import LABELS, NO_POSE, UNLABELLED, is_good, poses
 from wheretolook.evaluation.config import EvaluateConfig
@@ -33,14 +31,19 @@ RULES = replace(CONFIG, methods=("random", "visible", "bins"))
 
 
 @pytest.fixture(scope="module")
-def dataset(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+def dataset(tmp_path_factory):
     splits = ("train", "train", "test", "test", "val")
-    return make_dataset(tmp_path_factory.mktemp("data") / "tiny", splits, n_locations=14, n_directions=16)  # type: ignore[arg-type]
+    return make_dataset(tmp_path_factory.mktemp("data") / "tiny", splits, n_locations=14, n_directions=16)
 
 
-def test_evaluation_writes_prints_and_logs(
-    dataset: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def logged_runs(tracking):
+    """Return the newest evaluation's run, and the runs of its methods."""
+    parent = newest_run(tracking, "evaluate").info
+    found = client(tracking).search_runs([parent.experiment_id], f"tags.mlflow.parentRunId = '{parent.run_id}'")
+    return parent, {run.data.params["method"]: run for run in found}
+
+
+def test_evaluation_writes_prints_and_logs(dataset, tmp_path, capsys):
     tracking = TrackingConfig(str(tmp_path / "mlruns"), "tiny")
     models = train(dataset, TWO, tracking, False)
     table = evaluate(dataset, CONFIG, tracking, models=models, progress=True)
@@ -56,28 +59,22 @@ def test_evaluation_writes_prints_and_logs(
     assert pooled.loc[("bins", 1)]["normalized_0.05m_0.4deg"] == 1
     low, share, high = (table[f"raw_{end}5m_10deg"] for end in ("low_", "", "high_"))
     assert ((low <= share + 1e-9) & (share <= high + 1e-9)).all()
-
     results = dataset.root / "results"
     report = (results / "scores.md").read_text()
     assert report in capsys.readouterr().out and "| reprojections with bins | 100.0" in report
 
-    parent = newest_run(tracking, "evaluate", {"dataset": "tiny"})
-    assert parent is not None
-    parent_id = parent.info.run_id
-    runs = client(tracking).search_runs([parent.info.experiment_id], f"tags.mlflow.parentRunId = '{parent_id}'")
-    assert {run.data.params["method"] for run in runs} == methods and len(runs) == 6
-    for run, n in ((run, n) for run in runs for n in (1, 5)):
-        row = pooled.loc[(run.data.params["method"], n)]
-        chosen = pd.read_parquet(Path(run.info.artifact_uri) / "locations.parquet").query(f"top_n == {n}")
+    parent, runs = logged_runs(tracking)
+    assert runs.keys() == methods
+    for method, n in product(methods, (1, 5)):
+        row = pooled.loc[(method, n)]
+        chosen = pd.read_parquet(Path(runs[method].info.artifact_uri) / "locations.parquet").query(f"top_n == {n}")
         assert len(chosen) == row["n_locations"] == 2 * 14 and not chosen.duplicated(["scene", "location_id"]).any()
         assert chosen["chosen"].sum() == row["n_views"]
         assert chosen["good_5m_10deg"].sum() == pytest.approx(row["good_5m_10deg"])
-        for name in ("raw_0.25m_2deg", "regret_low_0.05m_0.4deg", "any_5m_10deg", "normalized_0.5m_5deg"):
-            assert run.data.metrics[f"top-{n}/{name}"] == pytest.approx(row[name])
-    artifacts = Path(parent.info.artifact_uri)
-    assert {path.name for path in artifacts.iterdir()} == {path.name for path in results.iterdir()}
+        for name in ("raw_0.25m_2deg", "regret_low_0.05m_0.4deg", "any_5m_10deg"):
+            assert runs[method].data.metrics[f"top-{n}/{name}"] == pytest.approx(row[name])
+    assert {path.name for path in Path(parent.artifact_uri).iterdir()} == {path.name for path in results.iterdir()}
 
-    pd.testing.assert_frame_equal(latest_scores(tracking), table)
     moved = TrackingConfig(str(tmp_path / "elsewhere"), "tiny")
     shutil.move(tmp_path / "mlruns", tmp_path / "elsewhere")
     pd.testing.assert_frame_equal(latest_scores(moved, "tiny"), table)
@@ -85,46 +82,38 @@ def test_evaluation_writes_prints_and_logs(
     with start_run(moved, "later", "evaluate", {"dataset": "tiny"}) as (mlflow, later):
         mlflow.log_text(later, "here", "note.txt")
     assert artifact(moved, later, "note.txt").read_text() == "here" and not (tmp_path / "mlruns").exists()
-    assert [run.info.run_id for run in finished_runs(moved, "evaluate")] == [later, parent_id]
+    assert [run.info.run_id for run in finished_runs(moved, "evaluate")] == [later, parent.run_id]
 
 
-def test_both_localizers_are_reported(tmp_path: Path) -> None:
+def test_both_localizers_are_reported(tmp_path):
     """By the first RANSAC result the same views localize, but none at a location with an odd number."""
     tracking = TrackingConfig(str(tmp_path / "mlruns"), "both")
     dataset = make_dataset(tmp_path / "both", ("test", "test"), n_locations=10, n_directions=12)
     report = dataset.root / "results" / "scores.md"
     tables = [scene.read_table() for scene in dataset.scenes]
-    compared = []
-    for table, scene in zip([None, *tables], [None, *dataset.scenes], strict=True):
-        if table is not None and scene is not None:
-            first = {f"first_{name}": table[name] for name in LABELS}
-            first["first_status"] = table["status"].where(table["location_id"] % 2 == 0, NO_POSE)
-            write_table(table.assign(**first), scene.table)
-        compared.append((evaluate(dataset, RULES, tracking, progress=False), report.read_text()))
-    (before, text), (half, text_of_half), (after, text_after) = compared
-    pd.testing.assert_frame_equal(half, before)  # one scene of two has no labels by the first result
-    assert text == text_of_half and "Both localizers" not in text
-    pd.testing.assert_frame_equal(after[[*before]], before)
+    before = evaluate(dataset, RULES, tracking, progress=False)
+    for table, scene in zip(tables, dataset.scenes, strict=True):
+        assert "Both localizers" not in report.read_text()  # not while one scene has no labels by the first result
+        first = {f"first_{name}": table[name] for name in LABELS}
+        first["first_status"] = table["status"].where(table["location_id"] % 2 == 0, NO_POSE)
+        write_table(table.assign(**first), scene.table)
+        after = evaluate(dataset, RULES, tracking, progress=False)
+        pd.testing.assert_frame_equal(after[[*before]], before)
 
     found = [table.assign(good=is_good(table)).groupby("location_id")["good"].any() for table in tables]
     share, first_share = (np.mean([one.to_numpy()[::step].sum() / len(one) for one in found]) for step in (1, 2))
     (row,) = after.query("method == 'bins' and top_n == 1 and scene == 'all'").to_dict("records")
     assert (row["raw_0.05m_0.4deg"], row["first_raw_0.05m_0.4deg"]) == pytest.approx((share, first_share))
     assert 0 < first_share < share and row["first_normalized_0.05m_0.4deg"] == 1
-    section = text_after.split("## Both localizers")[1].split("##")[0]
+    section = report.read_text().split("## Both localizers")[1].split("##")[0]
     (line,) = (line for line in section.splitlines() if line.startswith("| reprojections with bins |"))
     for cell, value in zip(line.split("|")[2:4], (share, first_share), strict=True):
         assert cell.split()[0] == f"{100 * value:.1f}"
-    parent = newest_run(tracking, "evaluate", {"dataset": "both"})
-    assert parent is not None
-    runs = client(tracking).search_runs(
-        [parent.info.experiment_id], f"tags.mlflow.parentRunId = '{parent.info.run_id}'"
-    )
-    (bins,) = (run for run in runs if run.data.params["method"] == "bins")
-    assert bins.data.metrics["top-1/first_raw_0.05m_0.4deg"] == pytest.approx(first_share)
+    _, runs = logged_runs(tracking)
+    assert runs["bins"].data.metrics["top-1/first_raw_0.05m_0.4deg"] == pytest.approx(first_share)
 
 
-def test_learned_methods_are_calibrated_on_the_val_scenes(dataset: Dataset, tmp_path: Path) -> None:
+def test_learned_methods_are_calibrated_on_the_val_scenes(dataset, tmp_path):
     tracking = TrackingConfig(str(tmp_path / "mlruns"))
     (model,) = train(dataset, train_config("mlp-2d+z", epochs=2, hidden=(16,), accelerator="cpu"), tracking, False)
     config = replace(CONFIG, methods=("bins", "mlp"))
@@ -155,10 +144,10 @@ def test_learned_methods_are_calibrated_on_the_val_scenes(dataset: Dataset, tmp_
     assert not (results / "calibration.csv").exists()
 
 
-def test_candidates_are_chosen_by_visibility(tmp_path: Path) -> None:
+def test_candidates_are_chosen_by_visibility(tmp_path):
     dataset = make_dataset(tmp_path / "ranked", ("test", "test"), n_locations=14, n_directions=16)
-    tables = []
     rng = np.random.default_rng(0)
+    tables = []
     for scene in dataset.scenes:
         table = scene.read_table()
         rank = np.concatenate([rng.permutation(16) for _ in range(14)])  # so that good and bad ones are among the first
@@ -171,29 +160,27 @@ def test_candidates_are_chosen_by_visibility(tmp_path: Path) -> None:
     table = evaluate(dataset, config, tracking, progress=False)
     assert list(table["candidates"].unique()) == ["all", "best 4"]
 
-    rows = table[table["candidates"] == "best 4"].set_index(["method", "top_n", "scene"])
+    table = table[(table["candidates"] == "best 4") & (table["scene"] == "all")].set_index(["method", "top_n"])
     best = views[views["visibility_rank"] < 4]
-    assert len(best) == 2 * 13 * 4
-    random = rows.loc[("random", 1, "all")]
-    assert (random["n_locations"], random["n_views"]) == (2 * 13, 2 * 13)
+    random = table.loc[("random", 1)]
+    assert len(best) == 2 * 13 * 4 and random["n_locations"] == random["n_views"] == 2 * 13
     assert random["raw_0.05m_0.4deg"] == pytest.approx(best["good"].mean())
-    # five of four are all of them
-    assert rows.loc[("visible", 5, "all"), "n_views"] == len(best)
-    assert rows.loc[("visible", 5, "all"), "good_0.05m_0.4deg"] == best["good"].sum()
+    everything = table.loc[("visible", 5)]  # five of four are all of them
+    assert (everything["n_views"], everything["good_0.05m_0.4deg"]) == (len(best), best["good"].sum())
     first = best.sort_values(["n_visible", "viewpoint_id"], ascending=[False, True]).groupby(["scene", "location_id"])
-    assert rows.loc[("visible", 1, "all"), "good_0.05m_0.4deg"] == first["good"].first().sum()
+    assert table.loc[("visible", 1), "good_0.05m_0.4deg"] == first["good"].first().sum()
 
+    for scene, table in zip(dataset.scenes, tables, strict=True):
+        bad_first = table.sort_values("good").groupby("location_id").cumcount() + 100 * (table["location_id"] == 3)
+        write_table(table.assign(visibility_rank=bad_first), scene.table)
     with pytest.raises(TableError):
-        for scene, table in zip(dataset.scenes, tables, strict=True):
-            bad_first = table.sort_values("good").groupby("location_id").cumcount() + 100 * (table["location_id"] == 3)
-            write_table(table.assign(visibility_rank=bad_first), scene.table)
         evaluate(dataset, replace(config, candidates=(0, 1)), tracking, progress=False)
 
 
-def test_the_same_evaluation_is_logged_once(dataset: Dataset, tmp_path: Path) -> None:
+def test_the_same_evaluation_is_logged_once(dataset, tmp_path):
     tracking = TrackingConfig(str(tmp_path / "mlruns"))
 
-    def evaluate_again(config: EvaluateConfig = RULES) -> list[str]:
+    def evaluate_again(config=RULES):
         evaluate(dataset, config, tracking, progress=False)
         return [run.info.run_id for run in finished_runs(tracking, "evaluate")]
 
@@ -219,23 +206,17 @@ def test_the_same_evaluation_is_logged_once(dataset: Dataset, tmp_path: Path) ->
 @pytest.mark.parametrize(
     "options",
     [
-        {"methods": ("psychic",)},
-        {"top_n": (0,)},
-        {"candidates": ()},
-        {"candidates": (100, 100)},
-        {"seed": -1},
-        {"thresholds": ((0.05, float("nan")),)},
-        {"thresholds": ((0.05, 0.4), (0.05, 0.4))},
-        {"block_m": -1.0},
+        {"methods": ("psychic",)}, {"top_n": (0,)}, {"candidates": ()}, {"candidates": (100, 100)}, {"seed": -1},
+        {"thresholds": ((0.05, float("nan")),)}, {"thresholds": ((0.05, 0.4), (0.05, 0.4))}, {"block_m": -1.0},
         {"heading": ((0.0, 0, 0),)},
     ],
-)
-def test_invalid_options(options: dict) -> None:
+)  # fmt: skip
+def test_invalid_options(options):
     with pytest.raises(ConfigError):
         EvaluateConfig(**options)
 
 
-def test_invalid_input(dataset: Dataset, tmp_path: Path) -> None:
+def test_invalid_input(dataset, tmp_path):
     tracking = TrackingConfig(str(tmp_path / "mlruns"))
     untrained = make_dataset(tmp_path / "untrained", ("test",), n_locations=2, n_directions=4)
     unlabelled = make_dataset(tmp_path / "unlabelled", ("test",), n_locations=2, n_directions=4)

@@ -1,9 +1,6 @@
 """Two runs on one dataset: what changes it runs alone, what reads it runs beside others, and who holds it is said."""
 
-from __future__ import annotations
-
 import os
-from pathlib import Path
 
 import pytest
 
@@ -12,21 +9,20 @@ from synthetic_dataset import make_dataset
 from wheretolook.cli import command_options, load_command, main
 from wheretolook.commands.train import train_methods
 from wheretolook.dataset.dataset_lock import changing, reading
-from wheretolook.dataset.layout import Dataset
 from wheretolook.tracking.store import TrackingConfig
 from wheretolook.training.trained_network import TrainedNetwork
 from wheretolook.utils.errors import InUseError
 
 
 @pytest.fixture
-def dataset(tmp_path: Path) -> Dataset:
+def dataset(tmp_path):
     dataset = make_dataset(tmp_path / "data" / "tiny")
     for scene in dataset.scenes:
         scene.stage_cache("label", "key").store()
     return dataset
 
 
-def run(dataset: Dataset, stage: str, *options: str) -> int:
+def run(dataset, stage, *options):
     root = dataset.root
     camera = ["--camera.width", "160", "--camera.height", "120", "--camera.focal_px", "80", "--camera.fov_deg", "null"]
     where = ["--name", root.name, "--data", str(root.parent)]
@@ -39,21 +35,19 @@ def run(dataset: Dataset, stage: str, *options: str) -> int:
     "stage",
     ["scenes", "map", "label", "train", "evaluate", "plan", "compare-paths", "release"],
 )  # fmt: skip
-def test_a_stage_stops_at_once_beside_one_that_changes_the_dataset(
-    dataset: Dataset, stage: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_stage_stops_at_once_beside_one_that_changes_the_dataset(dataset, stage, capsys):
     with changing(dataset.root, "label"):
         assert run(dataset, stage) == 2
     said = capsys.readouterr().err
     assert f"label, process {os.getpid()} on " in said
 
 
-def test_training_holds_the_labels_that_it_reads(dataset: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_training_holds_the_labels_that_it_reads(dataset, monkeypatch):
     config = train_config("mlp-2d", epochs=1, hidden=(8,), accelerator="cpu")
     tracking = TrackingConfig(str(dataset.root.parent / "mlruns"))
     save = TrainedNetwork.save
 
-    def save_beside_others(*given: object) -> None:
+    def save_beside_others(*given):
         with pytest.raises(InUseError), changing(dataset.root, "label"):
             pass
         with pytest.raises(InUseError):
@@ -69,7 +63,7 @@ def test_training_holds_the_labels_that_it_reads(dataset: Dataset, monkeypatch: 
     assert not list(dataset.root.glob(".*"))
 
 
-def test_files_of_killed_runs_are_removed_by_the_next_that_changes_the_dataset(dataset: Dataset) -> None:
+def test_files_of_killed_runs_are_removed_by_the_next_that_changes_the_dataset(dataset):
     folder = dataset.scenes[0].folder
     partial = [folder / ".map.partial" / "points3D.bin", folder / "viewpoints.parquet.partial",
                dataset.root / "weights" / "set.safetensors.partial", dataset.root / ".set-weights.lock"]  # fmt: skip

@@ -1,7 +1,5 @@
 """The sub-command that makes viewpoint maps."""
 
-from __future__ import annotations
-
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -24,7 +22,7 @@ RELEASED = Path(__file__).parents[2] / "data" / "release" / "weights"
 
 
 @pytest.fixture
-def dataset(tmp_path: Path) -> Path:
+def dataset(tmp_path):
     """Two scenes as the map stage leaves them, and a configuration."""
     write_room_dataset(tmp_path, LANDMARKS, names="ab")
     (tmp_path / "rooms.yaml").write_text(
@@ -33,12 +31,12 @@ def dataset(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def run(folder: Path, *options: str) -> int:
+def run(folder, *options):
     return main(["viewpoint-map", "--config", str(folder / "rooms.yaml"), "--data", str(folder / "data"),
                  "--device", "cpu", *options])  # fmt: skip
 
 
-def test_a_scenes_map_is_that_of_its_scorer(dataset: Path) -> None:
+def test_a_scenes_map_is_that_of_its_scorer(dataset):
     out = dataset / "a.map"
     assert run(dataset, "--scene", "a", "--method", "bins", "--out", str(out)) == 0
     found = ViewpointMap.load(out)
@@ -54,7 +52,7 @@ def test_a_scenes_map_is_that_of_its_scorer(dataset: Path) -> None:
 
 
 @pytest.mark.parametrize("method", ["mlp-2d+z", "set"])
-def test_weights_resolve_to_those_that_fit_the_camera(dataset: Path, method: str) -> None:
+def test_weights_resolve_to_those_that_fit_the_camera(dataset, method):
     rooms = Dataset.load(dataset / "data" / "rooms")
     assert resolve_weights(dataset=rooms) == shipped(WEIGHTS) / "set.safetensors"
     weights = dataset / "data" / "release" / "weights"
@@ -73,7 +71,7 @@ def test_weights_resolve_to_those_that_fit_the_camera(dataset: Path, method: str
     assert resolve_weights(dataset=rooms) == file
 
 
-def test_the_resolved_weights_score_a_map(dataset: Path) -> None:
+def test_the_resolved_weights_score_a_map(dataset):
     folder = dataset / "data" / "rooms" / "a" / "viewpoint-map"
     for options, scorer in (((), "set"), (("--weights", f"{WEIGHTS}/mlp-2d+z.safetensors"), "mlp-2d+z")):
         assert run(dataset, "--scene", "a", *options) == 0
@@ -90,5 +88,5 @@ def test_the_resolved_weights_score_a_map(dataset: Path) -> None:
         ["--scene", "a", "--viewpoint_map.grid", "[1, 1, 1]", "--scenes.free_space.clearance_m", "3"],
     ],
 )
-def test_invalid_input(dataset: Path, options: list[str]) -> None:
+def test_invalid_input(dataset, options):
     assert run(dataset, *options) == 2

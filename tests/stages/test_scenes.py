@@ -1,9 +1,5 @@
 """The scenes stage on a mesh of its user's: descriptions of datasets that cannot be read."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import pytest
 
 from box_scenes import furnished_room
@@ -14,7 +10,7 @@ from wheretolook.scenes.loading import save_glb
 from wheretolook.utils.errors import TableError
 
 
-def test_a_description_of_another_version_is_replaced(tmp_path: Path) -> None:
+def test_a_description_of_another_version_is_replaced(tmp_path):
     save_glb(furnished_room(), tmp_path / "room.glb")
     config = ScenesConfig(train=0, test=0, meshes=(MeshSource(tmp_path / "room.glb"),))
     stage = Scenes(name="mine", data=tmp_path, device="cpu", scenes=config)
@@ -22,6 +18,6 @@ def test_a_description_of_another_version_is_replaced(tmp_path: Path) -> None:
     (made.root / "dataset.json").write_text('{"scenes": ["room"]}')
     with pytest.raises(TableError, match="Run the scenes stage"):
         Dataset.load(made.root)
-    logged: list[str] = []
+    logged = []
     assert stage.run(log=logged.append) == made == Dataset.load(made.root)
     assert len(logged) == 1 and "reusing" in logged[0]

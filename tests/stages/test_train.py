@@ -1,7 +1,5 @@
 """The data module and the train stage on a tiny dataset whose labels follow a known rule."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path
@@ -18,7 +16,6 @@ from wheretolook.dataset.layout import Dataset
 from wheretolook.dataset.viewpoint_files import write_table
 from wheretolook.dataset.viewpoint_table import NO_POSE, UNLABELLED, is_good
 from wheretolook.scorers.mlp.network import ViewpointNetwork
-from wheretolook.scorers.train_config import TrainConfig
 from wheretolook.scorers.weights import load_scorer
 from wheretolook.tracking.store import TrackingConfig, client
 from wheretolook.training.data import ViewpointDataModule, hold_out_locations
@@ -31,28 +28,28 @@ pytestmark = pytest.mark.usefixtures("no_pictures")
 SMALL = train_config("mlp-2d", epochs=3, hidden=(32,), accelerator="cpu")
 
 
-def load(path: Path) -> ViewpointNetwork:
+def load(path):
     """The paper's network that lies in a file."""
     return TrainedNetwork.load(path, ViewpointNetwork, path.stem).network
 
 
-def data_of(dataset: Dataset, config: TrainConfig) -> ViewpointDataModule:
+def data_of(dataset, config):
     """The views that the paper's network learns from."""
     return ViewpointDataModule(dataset, config, config.mlp, progress=False)
 
 
 @pytest.fixture(scope="module")
-def store(tmp_path_factory: pytest.TempPathFactory) -> str:
+def store(tmp_path_factory):
     """One MLflow store for all tests: making its database takes seconds."""
     return str(tmp_path_factory.mktemp("mlruns"))
 
 
 @pytest.fixture
-def dataset(tmp_path: Path) -> Dataset:
+def dataset(tmp_path):
     return make_dataset(tmp_path / "data" / "tiny")
 
 
-def test_held_out_locations_are_whole_and_the_same_for_the_same_seed() -> None:
+def test_held_out_locations_are_whole_and_the_same_for_the_same_seed():
     scene = np.repeat([0, 0, 0, 0, 1, 1], 5)
     location = np.repeat([3, 5, 7, 9, 3, 5], 5)
     held_out = hold_out_locations(scene, location, 0.3, seed=4)
@@ -64,7 +61,7 @@ def test_held_out_locations_are_whole_and_the_same_for_the_same_seed() -> None:
     assert not hold_out_locations(scene[:5], location[:5], 0.3, seed=0).any()  # the only location is trained on
 
 
-def test_data_module_reads_labelled_train_views_only(dataset: Dataset) -> None:
+def test_data_module_reads_labelled_train_views_only(dataset):
     scene = dataset.scenes[0]
     table = scene.read_table()
     table.loc[table.index[::3], "status"] = UNLABELLED
@@ -82,14 +79,14 @@ def test_data_module_reads_labelled_train_views_only(dataset: Dataset) -> None:
     assert data.class_weights == pytest.approx((len(labels) / 2 / (len(labels) - n_good), len(labels) / 2 / n_good))
 
 
-def test_validation_scenes_are_used_where_there_are_some(tmp_path: Path) -> None:
+def test_validation_scenes_are_used_where_there_are_some(tmp_path):
     dataset = make_dataset(tmp_path / "tiny", ("train", "val", "test"), n_locations=6, n_directions=12)
     data = data_of(dataset, SMALL)
     assert {*data.views.scene[data.train_rows]} == {0}
     assert {*data.views.scene[data.val_rows]} == {1}
 
 
-def test_every_epoch_visits_every_training_view_once_in_its_own_order(dataset: Dataset) -> None:
+def test_every_epoch_visits_every_training_view_once_in_its_own_order(dataset):
     data = data_of(dataset, changed(SMALL, batch_size=100))
     loader = data.train_dataloader()
     first, second = (torch.cat([batch.labels for batch in loader]) for _ in range(2))
@@ -98,7 +95,7 @@ def test_every_epoch_visits_every_training_view_once_in_its_own_order(dataset: D
     assert torch.equal(first, torch.cat([batch.labels for batch in data.train_dataloader()]))
 
 
-def test_balanced_training_views_are_equally_many_and_all_of_the_rarer_class(dataset: Dataset) -> None:
+def test_balanced_training_views_are_equally_many_and_all_of_the_rarer_class(dataset):
     for scene in dataset.split("train"):
         table = scene.read_table()
         write_table(table.assign(status=np.where(table.index % 4 == 0, table["status"], NO_POSE)), scene.table)
@@ -115,31 +112,23 @@ def test_balanced_training_views_are_equally_many_and_all_of_the_rarer_class(dat
 @pytest.mark.parametrize(
     "options",
     [
-        {"methods": ("mlp-2d", "mlp-5d")},
-        {"epochs": 0},
-        {"dropout": 1.0},
-        {"val_fraction": 0.0},
-        {"layout": "sideways"},
-        {"learning_rate": float("nan")},
-        {"l2": -1.0},
-        {"devices": 0},
+        {"methods": ("mlp-2d", "mlp-5d")}, {"epochs": 0}, {"dropout": 1.0}, {"val_fraction": 0.0},
+        {"layout": "sideways"}, {"learning_rate": float("nan")}, {"l2": -1.0}, {"devices": 0},
     ],
-)
-def test_options_out_of_range_are_refused(options: dict) -> None:
+)  # fmt: skip
+def test_options_out_of_range_are_refused(options):
     with pytest.raises(ConfigError):
         changed(SMALL, **options)
 
 
-def test_training_learns_the_rule_logs_a_run_and_is_reused(dataset: Dataset, store: str) -> None:
+def test_training_learns_the_rule_logs_a_run_and_is_reused(dataset, store):
     tracking = TrackingConfig(store, "tiny")
     config = changed(SMALL, methods=("mlp-2d", "mlp-2d+3d"), epochs=4, noise_px=0.5, noise_m=0.02, schedule="cosine")
     models = train(dataset, config, tracking, progress=False)
-    assert [model.method for model in models] == ["mlp-2d", "mlp-2d+3d"]
-    for model in models:
-        assert model.metrics["val_average_precision"] > 0.9
+    for method, model in zip(config.methods, models, strict=True):
+        assert model.method == method and model.metrics["val_average_precision"] > 0.9
         run = client(tracking).get_run(model.run_id)
-        assert run.info.status == "FINISHED"
-        assert run.data.params["method"] == model.method
+        assert (run.info.status, run.data.params["method"]) == ("FINISHED", method)
         history = client(tracking).get_metric_history(model.run_id, "val_average_precision")
         assert [metric.step for metric in history] == [0, 1, 2, 3]
         assert max(metric.value for metric in history) == pytest.approx(model.metrics["val_average_precision"])
@@ -150,16 +139,14 @@ def test_training_learns_the_rule_logs_a_run_and_is_reused(dataset: Dataset, sto
     before = {path: path.stat().st_mtime_ns for path in (dataset.root / "weights").iterdir()}
     again = train(dataset, config, tracking, progress=False)
     assert [(model.run_id, model.reused) for model in again] == [(model.run_id, True) for model in models]
-    assert {path: path.stat().st_mtime_ns for path in (dataset.root / "weights").iterdir()} == before
-
+    assert {path: path.stat().st_mtime_ns for path in before} == before
     models[0].path.write_bytes(b"changed")
     scene = dataset.split("test")[0]
     write_table(scene.read_table().iloc[:-1], scene.table)  # test scenes do not change the training
-    third = train(dataset, config, tracking, progress=False)
-    assert [model.reused for model in third] == [False, True]
+    assert [model.reused for model in train(dataset, config, tracking, progress=False)] == [False, True]
 
 
-def test_further_datasets_are_trained_on(dataset: Dataset, store: str) -> None:
+def test_further_datasets_are_trained_on(dataset, store):
     other = make_dataset(dataset.root.parent / "other", ("val", "test", "test", "test", "train"), n_locations=5)
     tracking = TrackingConfig(store, "also")
     config = changed(SMALL, epochs=1, also=("other",))
@@ -175,7 +162,7 @@ def test_further_datasets_are_trained_on(dataset: Dataset, store: str) -> None:
     assert again.reused and not without.reused
 
 
-def test_invalid_further_datasets(dataset: Dataset, store: str) -> None:
+def test_invalid_further_datasets(dataset, store):
     other = make_dataset(dataset.root.parent / "other", ("test", "train"), n_locations=5)
     make_dataset(dataset.root.parent / "tests", ("test",), n_locations=2)
     shutil.copy(dataset.split("test")[0].landmarks, other.scenes[1].landmarks)  # would train on a test scene
@@ -189,7 +176,7 @@ def test_invalid_further_datasets(dataset: Dataset, store: str) -> None:
             train(dataset, changed(SMALL, also=names), TrackingConfig(store, "also"), progress=False)
 
 
-def test_the_same_seed_gives_the_same_weights(dataset: Dataset, store: str) -> None:
+def test_the_same_seed_gives_the_same_weights(dataset, store):
     config = changed(SMALL, noise_px=1.0)
     tracking = TrackingConfig(store, "same seed")
     torch.manual_seed(123)
@@ -202,7 +189,7 @@ def test_the_same_seed_gives_the_same_weights(dataset: Dataset, store: str) -> N
 
 
 @pytest.mark.slow
-def test_two_processes_train_as_one_does(dataset: Dataset, store: str) -> None:
+def test_two_processes_train_as_one_does(dataset, store):
     # 920 training views: the last batch has one view, so that one of two processes has none
     tracking = TrackingConfig(store, "devices")
     one = changed(SMALL, dropout=0.0, batch_size=919)
@@ -219,7 +206,7 @@ def test_two_processes_train_as_one_does(dataset: Dataset, store: str) -> None:
     assert train(dataset, one, tracking, progress=False)[0].reused
 
 
-def test_the_released_variant_trains_as_the_released_code(dataset: Dataset, store: str) -> None:
+def test_the_released_variant_trains_as_the_released_code(dataset, store):
     config = changed(SMALL, methods=("mlp-2d+3d", "mlp-released"), epochs=2, hidden=(16,))
     ours, released = train(dataset, config, TrackingConfig(store), progress=False)
     spec = load(released.path).spec

@@ -4,8 +4,6 @@ Other packages keep the modules and files by which they do on Linux what they do
 signals are removed for all. Worker processes run this file, too, before they import wheretolook.
 """
 
-from __future__ import annotations
-
 import builtins
 import errno
 import json
@@ -21,11 +19,11 @@ OF_SIGNALS = ["alarm", "setitimer", "getitimer", "ITIMER_REAL", "pthread_kill", 
 OF_OS = ["sched_getaffinity", "sched_setaffinity", "pread", "pwrite", "O_NOFOLLOW", "O_NONBLOCK"]
 
 msvcrt = ModuleType("msvcrt")
-msvcrt.LK_NBLCK = 2  # type: ignore[attr-defined]
+msvcrt.LK_NBLCK = 2
 original_import = builtins.__import__
 
 
-def locking(file: int, mode: int, n_bytes: int) -> None:
+def locking(file, mode, n_bytes):
     """Lock bytes from the current position as Windows does, here by lockf(3)."""
     try:
         os.lockf(file, os.F_TLOCK, n_bytes)
@@ -33,7 +31,7 @@ def locking(file: int, mode: int, n_bytes: int) -> None:
         raise PermissionError(errno.EACCES, "Permission denied") from error
 
 
-def import_elsewhere(name, globals=None, locals=None, fromlist=(), level=0):  # type: ignore[no-untyped-def]
+def import_elsewhere(name, globals=None, locals=None, fromlist=(), level=0):
     if str((globals or {}).get("__name__")).partition(".")[0].startswith("wheretolook"):
         if name in POSIX_ONLY:
             raise ModuleNotFoundError(f"No module named '{name}'", name=name)
@@ -42,18 +40,18 @@ def import_elsewhere(name, globals=None, locals=None, fromlist=(), level=0):  # 
     return original_import(name, globals, locals, fromlist, level)
 
 
-def without_proc(event: str, given: tuple[object, ...]) -> None:
+def without_proc(event, given):
     if event in ("open", "os.listdir", "os.scandir") and str(given[0]).startswith("/proc"):
         frame = sys._getframe(1)
         while frame is not None:
             if frame.f_globals.get("__name__", "").partition(".")[0] == "psutil":
                 return
-            frame = frame.f_back  # type: ignore[assignment]
+            frame = frame.f_back
         raise FileNotFoundError(errno.ENOENT, "No such file or directory", given[0])
 
 
-def leave_posix() -> None:
-    msvcrt.locking = locking  # type: ignore[attr-defined]
+def leave_posix():
+    msvcrt.locking = locking
     builtins.__import__ = import_elsewhere
     for name in [name for name in dir(signal) if name.startswith("SIG") and name[3:4] != "_" and name not in KEEP]:
         delattr(signal, name)

@@ -1,12 +1,9 @@
 """The commands run where Linux's and POSIX's functions, modules, signals and files are missing, with the same result."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -14,27 +11,14 @@ import pandas as pd
 import pytest
 
 from selection.room import POINTS, WEIGHTS, write_room
+from stages.test_pipeline import EXPERIMENT
 from wheretolook.cli import main
 from wheretolook.dataset.layout import Dataset
 
 SCRIPT = Path(__file__).with_name("elsewhere.py")
 
-EXPERIMENT = """\
-name: tiny
-device: cpu
-camera: {width: 320, height: 240, focal_px: 160}
-scenes:
-  train: 1
-  test: 1
-mapping: {n_images: 24}
-sample: {grid: [6, 6, 4], directions: 100, keep: 50, max_locations: 8, max_directions: 5}
-label: {workers: 2, shard_size: 20}
-train: {methods: [mlp-2d], mlp: {epochs: 2}}
-evaluate: {methods: [random, visible, mlp]}
-"""
 
-
-def run_elsewhere(folder: Path, *commands: Sequence[str]) -> str:
+def run_elsewhere(folder, *commands):
     """Run commands in a folder, in one process. Returns what they print."""
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
     run = [sys.executable, str(SCRIPT), json.dumps(commands)]
@@ -43,7 +27,7 @@ def run_elsewhere(folder: Path, *commands: Sequence[str]) -> str:
     return done.stdout
 
 
-def test_select_and_score(tmp_path: Path) -> None:
+def test_select_and_score(tmp_path):
     sparse = write_room(tmp_path / "sparse")
     np.savetxt(tmp_path / "at.csv", POINTS, delimiter=",", header="x,y,z", comments="")
     given = ["--map", str(sparse), "--weights", str(WEIGHTS), "--device", "cpu"]
@@ -56,10 +40,12 @@ def test_select_and_score(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_from_scenes_to_evaluation(tmp_path: Path) -> None:
-    (tmp_path / "tiny.yaml").write_text(EXPERIMENT)
+def test_from_scenes_to_evaluation(tmp_path):
+    (tmp_path / "tiny.yaml").write_text(
+        EXPERIMENT.replace("workers: 1", "workers: 2").replace("[mlp-2d, mlp-2d+3d, set]", "[mlp-2d]")
+    )
     stages = ("scenes", "map", "sample", "label", "train", "evaluate")
-    run_elsewhere(tmp_path, *([stage, "--config", "tiny.yaml"] for stage in stages))
+    run_elsewhere(tmp_path, *([stage, "--config", "tiny.yaml", "--device", "cpu"] for stage in stages))
     dataset = Dataset.load(tmp_path / "data" / "tiny")
     assert not any((scene.read_table()["status"] == "unlabelled").any() for scene in dataset.scenes)
     assert {"random", "visible", "mlp-2d"} <= {*pd.read_csv(dataset.root / "results" / "scores.csv")["method"]}
@@ -68,7 +54,7 @@ def test_from_scenes_to_evaluation(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["sched_getaffinity", "fcntl", "SIGALRM", "/proc/meminfo"])
-def test_what_elsewhere_lacks_is_missing(name: str, tmp_path: Path) -> None:
+def test_what_elsewhere_lacks_is_missing(name, tmp_path):
     """Otherwise the tests above would pass on Linux in any case."""
     code = {
         "sched_getaffinity": "import os; os.sched_getaffinity(0)",

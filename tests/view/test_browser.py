@@ -1,10 +1,5 @@
 """The viewer in headless Chromium: clicks, paths, links; without errors in the browser."""
 
-from __future__ import annotations
-
-from collections.abc import Iterator
-from typing import Any
-
 import numpy as np
 import pytest
 
@@ -24,7 +19,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.skipif(chromium() is None, reason="t
 
 
 @pytest.fixture(scope="module")
-def viewer(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Viewer]:
+def viewer(tmp_path_factory):
     viewed = open_map(write_room(tmp_path_factory.mktemp("room") / "sparse"), weights=WEIGHTS)
     poses = poses_looking_along(POINTS, np.tile((-1.0, -0.5, 0.0), (4, 1)))
     localized = np.array([True, True, False, True])
@@ -35,20 +30,20 @@ def viewer(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Viewer]:
 
 
 @pytest.fixture(scope="module")
-def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+def browser(tmp_path_factory):
     made = Browser(tmp_path_factory.mktemp("profile"), (1100, 700))
     yield made
     made.close()
 
 
-def pixel_of(camera: Any, point: np.ndarray) -> tuple[float, float]:
+def pixel_of(camera, point):
     """Project a world point into a client's window."""
     x, y, z = rotation_from_quaternion(camera.wxyz).T @ (point - camera.position)
     focal = camera.image_height / 2 / np.tan(camera.fov / 2)
     return camera.image_width / 2 + focal * x / z, camera.image_height / 2 + focal * y / z
 
 
-def test_a_location_is_clicked_and_a_link_opens_the_same_view(viewer: Viewer, browser: Browser) -> None:
+def test_a_location_is_clicked_and_a_link_opens_the_same_view(viewer, browser):
     tab = browser.open(f"http://{viewer.address}")
     tab.wait(lambda tab: "Click a location" in tab.text and " locations" in tab.text)
     (session,) = viewer.sessions.values()
@@ -65,7 +60,7 @@ def test_a_location_is_clicked_and_a_link_opens_the_same_view(viewer: Viewer, br
     assert tab.errors == other.errors == []
 
 
-def test_rings_turn_the_view(viewer: Viewer, browser: Browser) -> None:
+def test_rings_turn_the_view(viewer, browser):
     at = np.array([1.6, 2.1, 1.5])
     tab = browser.open(ViewState(occlusion="none", n=3, place=(1.6, 2.1, 1.5)).link(f"localhost:{viewer.port}"))
     tab.wait(lambda tab: "landmarks in view" in tab.text)
@@ -80,7 +75,7 @@ def test_rings_turn_the_view(viewer: Viewer, browser: Browser) -> None:
     assert tab.errors == []
 
 
-def test_a_button_leaves_first_person(viewer: Viewer, browser: Browser) -> None:
+def test_a_button_leaves_first_person(viewer, browser):
     tab = browser.open(ViewState(occlusion="none", place=(1.6, 2.1, 1.5)).link(f"localhost:{viewer.port}"))
     tab.wait(lambda tab: "landmarks in view" in tab.text)
     assert "camera height" in tab.text and "Leave first person" not in tab.text

@@ -1,9 +1,5 @@
 """`wheretolook view --record` and `--film`."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import pytest
 from PIL import Image
 
@@ -14,7 +10,7 @@ from wheretolook.scenes.loading import save_glb
 from wheretolook.select.where_to_look import WhereToLook
 
 
-def test_a_recording_holds_scene_floor_and_paths(tmp_path: Path) -> None:
+def test_a_recording_holds_scene_floor_and_paths(tmp_path):
     pytest.importorskip("rerun")
     from rerun.chunk import RrdReader
 
@@ -30,7 +26,7 @@ def test_a_recording_holds_scene_floor_and_paths(tmp_path: Path) -> None:
     assert {f"/world/{name}" for name in names} | {"/score/way", "/score/forward"} <= entities
 
 
-def test_a_film_shows_both_paths_step_by_step(tmp_path: Path) -> None:
+def test_a_film_shows_both_paths_step_by_step(tmp_path):
     save_glb(furnished_room(), tmp_path / "room.glb")
     sparse = write_room(tmp_path / "sparse", n=200)
     rows = [" ".join(map(str, (0, *point, 0, 0, 0, 1))) for point in POINTS]
@@ -39,4 +35,4 @@ def test_a_film_shows_both_paths_step_by_step(tmp_path: Path) -> None:
     options += ["--method", "visible", "--state", "occlusion=none", "--film", str(tmp_path / "way.webp")]
     assert main(["view", *options]) == 0
     with Image.open(tmp_path / "way.webp") as film:
-        assert film.n_frames == len(POINTS)  # type: ignore[attr-defined]
+        assert film.n_frames == len(POINTS)

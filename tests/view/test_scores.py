@@ -1,28 +1,24 @@
 """What the viewer computes, against the scorers themselves."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 from selection.room import POINTS, WEIGHTS, write_room
 from synthetic_dataset import CAMERA, make_dataset
-from wheretolook.geometry.poses import poses_looking_along
+from wheretolook.geometry.poses import poses_looking_along, transform
 from wheretolook.mapping.config import FrameOptions
 from wheretolook.select.where_to_look import WhereToLook
 from wheretolook.utils.errors import TableError
 from wheretolook.view import drawing
-from wheretolook.view.viewed_map import FIRST_CELLS, ViewedMap, open_map, open_scene, score_in_blocks, score_location
+from wheretolook.view.viewed_map import FIRST_CELLS, open_map, open_scene, score_location
 
 
 @pytest.fixture(scope="module")
-def room(tmp_path_factory: pytest.TempPathFactory) -> ViewedMap:
+def room(tmp_path_factory):
     return open_map(write_room(tmp_path_factory.mktemp("view") / "sparse"), weights=WEIGHTS)
 
 
-def test_a_floor_has_the_best_score_of_each_free_cell(room: ViewedMap) -> None:
+def test_a_floor_has_the_best_score_of_each_free_cell(room):
     floor = room.floor("visible", "none", 1.5)
     selector = floor.selector
     assert room.space.is_free(floor.points).all() and len({*floor.cells.tolist()}) == len(floor.cells)
@@ -40,7 +36,7 @@ def test_a_floor_has_the_best_score_of_each_free_cell(room: ViewedMap) -> None:
     assert floor.raster()[row, column] == floor.scores[7]
 
 
-def test_the_best_views_of_a_location_are_those_of_select(room: ViewedMap) -> None:
+def test_the_best_views_of_a_location_are_those_of_select(room):
     selector = room.selector("set", "hidden-points")
     location = score_location(selector, POINTS[0], 4)
     chosen = WhereToLook(selector.scorer, selector.directions).best(POINTS[:1], 4)
@@ -50,18 +46,16 @@ def test_the_best_views_of_a_location_are_those_of_select(room: ViewedMap) -> No
         score_location(selector, np.array([80.0, 0.0, 1.0]), 1)
 
 
-def test_locations_are_in_the_world_whatever_the_unit_of_the_map(tmp_path: Path) -> None:
-    halved = open_map(
-        write_room(tmp_path / "sparse", metric=False), weights=WEIGHTS, frame=FrameOptions(scale=0.5, up="z")
-    )
-    assert halved.frame.world_from_map.scale == 0.5
+def test_locations_are_in_the_world_whatever_the_unit_of_the_map(tmp_path):
+    folder = write_room(tmp_path / "sparse", metric=False)
+    halved = open_map(folder, weights=WEIGHTS, frame=FrameOptions(scale=0.5, up="z"))
     selector = halved.selector("set", "none")
     best = score_location(selector, 0.5 * POINTS[0], 4).best
     np.testing.assert_allclose(best.positions, np.tile(0.5 * POINTS[0], (4, 1)), atol=1e-9)
     np.testing.assert_allclose(best.score, selector.scorer.score(best.cam_from_world), atol=1e-6)
 
 
-def test_probabilities_of_visible_landmarks_sum_to_the_expected_inliers(room: ViewedMap) -> None:
+def test_probabilities_of_visible_landmarks_sum_to_the_expected_inliers(room):
     scorer = room.selector("set", "none").scorer
     pose = poses_looking_along(POINTS[0], (-1.0, -0.5, 0.0))
     landmarks = room.visible_landmarks("set", "none", pose)
@@ -72,19 +66,7 @@ def test_probabilities_of_visible_landmarks_sum_to_the_expected_inliers(room: Vi
     np.testing.assert_array_equal(counted.probabilities, landmarks.probabilities)
 
 
-def test_labelled_views_are_scored_in_blocks(room: ViewedMap, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("wheretolook.view.viewed_map.BLOCK", 3)
-    scorer = room.selector("set", "none").scorer
-    axes = np.array([(-1.0, -0.5, 0.0), (1.0, 0.2, 0.0), (-1.0, 0.0, 0.0), (0.3, 1.0, 0.0)])
-    poses = poses_looking_along(np.tile(POINTS[0], (4, 1)), axes)
-    steps = score_in_blocks(scorer, poses)
-    assert next(steps) is next(steps) is None
-    with pytest.raises(StopIteration) as ended:
-        next(steps)
-    np.testing.assert_allclose(ended.value.value, scorer.score(poses))
-
-
-def test_a_scene_of_a_dataset_has_its_labels(tmp_path: Path) -> None:
+def test_a_scene_of_a_dataset_has_its_labels(tmp_path):
     dataset = make_dataset(tmp_path / "set", ("test",), n_locations=4, n_directions=5)
     viewed = open_scene(tmp_path, dataset.scenes[0].name, "", None, WEIGHTS, "cpu")
     assert viewed.labels is not None and len(viewed.labels) == 20 and viewed.camera == CAMERA
@@ -92,9 +74,18 @@ def test_a_scene_of_a_dataset_has_its_labels(tmp_path: Path) -> None:
     assert len(viewed.floor("visible", "none", 1.5).cells)
 
 
-def test_colours_of_scores() -> None:
+def test_colours_of_scores():
     image = drawing.floor_image(np.array([[0.0, np.nan], [1.0, 0.4]]), 0, 1, 0.5)
     cell = drawing.CELL_PX
     assert image.shape == (2 * cell, 2 * cell, 4) and image[0, cell, 3] == 0 and image[0, 0, 3] > 200
     np.testing.assert_array_equal(image[cell, 0, :3], drawing.score_colors(np.array(1.0)))
-    assert (drawing.score_colors(np.array([np.nan])) == drawing.UNKNOWN).all()
+
+
+def test_frustum_corners_project_to_image_corners():
+    poses = poses_looking_along([[1.0, 2.0, 3.0]] * 2, [[1.0, 0, 0], [0.3, -1, 0.2]])
+    corners = drawing.frustum_corners(CAMERA, poses, 0.5)
+    np.testing.assert_allclose(corners[:, 0], [[1, 2, 3]] * 2)
+    for pose, four in zip(poses, corners[:, 1:], strict=True):
+        in_camera = transform(pose, four)
+        np.testing.assert_allclose(in_camera[:, 2], 0.5)
+        np.testing.assert_allclose(CAMERA.project(in_camera), [[0, 0], [160, 0], [160, 120], [0, 120]], atol=1e-9)

@@ -1,13 +1,8 @@
 """The viewer's server and sessions, without a browser."""
 
-from __future__ import annotations
-
 import threading
 import time
-from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 from urllib.error import HTTPError
 from urllib.parse import quote
 from urllib.request import urlopen
@@ -29,7 +24,6 @@ from wheretolook.planning.config import FORWARD
 from wheretolook.scenes.loading import save_glb
 from wheretolook.utils.errors import ConfigError, InUseError, MapWarning
 from wheretolook.view.drawing import escape_markdown
-from wheretolook.view.page import intersect_plane
 from wheretolook.view.server import Viewer, check_port
 from wheretolook.view.state import RecordedPath, ViewState, looking_ahead
 from wheretolook.view.viewed_map import open_map
@@ -38,12 +32,12 @@ STATE = ViewState(method="visible", occlusion="none")
 
 
 @pytest.fixture(scope="module")
-def sparse(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def sparse(tmp_path_factory):
     return write_room(tmp_path_factory.mktemp("view") / "sparse")
 
 
 @pytest.fixture
-def viewer(sparse: Path) -> Iterator[Viewer]:
+def viewer(sparse):
     viewed = open_map(sparse, weights=WEIGHTS)
     viewed.paths = {FORWARD: RecordedPath(looking_ahead(np.tile(POINTS, (20, 1))))}
     made = Viewer(viewed, port=0, state=STATE)
@@ -51,36 +45,36 @@ def viewer(sparse: Path) -> Iterator[Viewer]:
     made.stop()
 
 
-def connect(viewer: Viewer, path: str = "", headers: dict[str, str] | None = None) -> Any:
+def connect(viewer, path="", headers=None):
     import viser
     from websockets.sync import client
 
     address = f"ws://127.0.0.1:{viewer.port}/{path}"
-    protocols: Any = [f"viser-v{viser.__version__}"]
+    protocols = [f"viser-v{viser.__version__}"]
     return client.connect(address, subprotocols=protocols, max_size=None, close_timeout=1, additional_headers=headers)
 
 
-def message(kind: str, **fields: object) -> bytes:
+def message(kind, **fields):
     return msgspec.msgpack.encode({"type": kind, **fields})
 
 
-def camera(x: float = 0.0) -> bytes:
+def camera(x=0.0):
     """What a browser sends when it joins and when its camera moves."""
     pose = {"wxyz": [1, 0, 0, 0], "position": [x, 0, 9], "look_at": [0, 0, 0], "up_direction": [0, 0, 1]}
     return message("ViewerCameraMessage", **pose, fov=1.0, near=0.1, far=99.0, image_height=600, image_width=800)
 
 
-def click(z: float = -1.0) -> bytes:
+def click(z=-1.0):
     ray = {"ray_origin": [1.5, 2.0, 9.0], "ray_direction": [0.01, 0, z]}
     return message("ScenePointerMessage", event_type="click", screen_pos=[[0.5, 0.5]], modifier=None, **ray)
 
 
-def setting(session: Any, control: str, value: object, field: str = "value") -> bytes:
+def setting(session, control, value, field="value"):
     handle = getattr(session.controls, control)
     return message("GuiUpdateMessage", uuid=handle._impl.uuid, updates={field: value})
 
 
-def join(viewer: Viewer, client: Any) -> Any:
+def join(viewer, client):
     """Wait for the session of the newest client, which can be clicked."""
     n = len(viewer.sessions)
     client.send(camera())
@@ -90,7 +84,7 @@ def join(viewer: Viewer, client: Any) -> Any:
     return session
 
 
-def test_clients_have_their_own_state_and_survive_invalid_messages(viewer: Viewer) -> None:
+def test_clients_have_their_own_state_and_survive_invalid_messages(viewer):
     with connect(viewer) as first, connect(viewer, "?view=n=2;place=1.5,2,1.5;method=bins") as second:
         one = join(viewer, first)
         other = join(viewer, second)
@@ -108,7 +102,7 @@ def test_clients_have_their_own_state_and_survive_invalid_messages(viewer: Viewe
         np.testing.assert_allclose(one.location.position[:2], (1.5, 2), atol=0.1)
 
 
-def test_a_flood_of_messages_does_not_delay_other_clients(viewer: Viewer) -> None:
+def test_a_flood_of_messages_does_not_delay_other_clients(viewer):
     with connect(viewer) as bad, connect(viewer) as good:
         session = join(viewer, bad)
         n_threads = threading.active_count()
@@ -129,11 +123,11 @@ def test_a_flood_of_messages_does_not_delay_other_clients(viewer: Viewer) -> Non
         assert threading.active_count() < n_threads + 12
 
 
-def test_invalid_values_of_controls_are_reported_and_restored(viewer: Viewer) -> None:
+def test_invalid_values_of_controls_are_reported_and_restored(viewer):
     with connect(viewer) as client:
         session = join(viewer, client)
         controls = session.controls
-        errors: list[Exception] = []
+        errors = []
         session.show_error = errors.append
         values = {"method": "../../weights", "occlusion": "x", "n": 10**9, "height": float("nan")}
         values |= {"threshold": float("inf"), "cut": -1e300, "limits": "no", "yaw": 1e9}
@@ -145,7 +139,7 @@ def test_invalid_values_of_controls_are_reported_and_restored(viewer: Viewer) ->
         assert session.state.n == 5 and np.isfinite(session.state.height)
 
 
-def test_only_the_page_is_served(viewer: Viewer) -> None:
+def test_only_the_page_is_served(viewer):
     with urlopen(f"http://127.0.0.1:{viewer.port}") as answer:
         assert b"<html" in answer.read(2000).lower()
     for path in ("/../../etc/passwd", "/%2e%2e/%2e%2e/etc/passwd", "/sparse/images.bin"):
@@ -154,7 +148,7 @@ def test_only_the_page_is_served(viewer: Viewer) -> None:
     assert viewer.server.request_share_url() is None and viewer.server.get_host() == "127.0.0.1"
 
 
-def test_pages_of_other_sites_are_rejected(viewer: Viewer) -> None:
+def test_pages_of_other_sites_are_rejected(viewer):
     for origin in ("http://localhost:8080", "http://[::1]:8080", "https://mine.example"):
         assert viewer._is_allowed({"Origin": origin, "X-Forwarded-Host": "mine.example"})
     for origin in ("https://evil.example", "https://localhost.evil.example", "null", "http://["):
@@ -167,7 +161,7 @@ def test_pages_of_other_sites_are_rejected(viewer: Viewer) -> None:
     assert viewer._is_allowed({"Origin": "https://evil.example"})
 
 
-def test_text_of_files_and_links_is_escaped(viewer: Viewer) -> None:
+def test_text_of_files_and_links_is_escaped(viewer):
     hostile = "<iframe srcdoc='<script>steal()</script>'> ![x](http://evil/x) **b** `c` &lt;a&gt; [l](javascript:x)"
     shown = MarkdownIt().render(escape_markdown(hostile))
     assert shown.count("<") == 2 and "<p>&lt;iframe" in shown  # the paragraph only
@@ -176,7 +170,7 @@ def test_text_of_files_and_links_is_escaped(viewer: Viewer) -> None:
         wait_until(lambda: "\\<img src" in session.controls.summary.content)
 
 
-def test_a_mesh_in_another_frame_is_reported_in_terminal_and_page(sparse: Path, tmp_path: Path) -> None:
+def test_a_mesh_in_another_frame_is_reported_in_terminal_and_page(sparse, tmp_path):
     room = furnished_room()
     save_glb(room, tmp_path / "room.glb")
     assert not open_map(sparse, tmp_path / "room.glb", weights=WEIGHTS).warnings
@@ -186,7 +180,7 @@ def test_a_mesh_in_another_frame_is_reported_in_terminal_and_page(sparse: Path, 
     assert any("from the mesh" in text for text in viewed.warnings)
 
 
-def test_paths_are_drawn_with_their_cameras(viewer: Viewer) -> None:
+def test_paths_are_drawn_with_their_cameras(viewer):
     positions = camera_centers(viewer.viewed.paths[FORWARD].cam_from_world)
     with connect(viewer) as client:
         lines = join(viewer, client).scene.get_handle_by_name(f"/paths/{FORWARD}").points
@@ -194,13 +188,7 @@ def test_paths_are_drawn_with_their_cameras(viewer: Viewer) -> None:
     assert len(lines) == len(positions) - 1 + 8 * len(positions)  # edges of a frustum
 
 
-def test_rays_meet_the_floor() -> None:
-    np.testing.assert_allclose(intersect_plane((0, 0, 5), (1, 0, -2), 1.0), (2, 0, 1))  # type: ignore[arg-type]
-    for direction in ((1, 0, 2), (1, 0, 0), (1, 0, np.nan), ()):
-        assert intersect_plane((0, 0, 5), direction, 1.0) is None
-
-
-def test_a_port_in_use(viewer: Viewer) -> None:
+def test_a_port_in_use(viewer):
     with pytest.raises(InUseError):
         check_port("127.0.0.1", viewer.port)
 
@@ -213,5 +201,5 @@ def test_a_port_in_use(viewer: Viewer) -> None:
         "--map nowhere --film way.mp4", "--map nowhere --record x.txt",
     ],
 )  # fmt: skip
-def test_invalid_options(options: str) -> None:
+def test_invalid_options(options):
     assert main(["view", *options.split(), *([] if "--port" in options else ["--port", "0"])]) == 2

@@ -1,11 +1,8 @@
 """Which weights score in the viewer: given, the scene's own, or bundled."""
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,18 +10,17 @@ import torch
 
 from selection.room import WEIGHTS, write_room
 from synthetic_dataset import make_dataset
-from wheretolook.dataset.layout import Dataset
 from wheretolook.scorers.adapted.score import AdaptedNetwork
 from wheretolook.scorers.set.network import SetNetwork
 from wheretolook.training.provenance import training_fingerprint
 from wheretolook.training.trained_network import TrainedNetwork
 from wheretolook.utils.errors import WeightsError
-from wheretolook.view.viewed_map import ViewedMap, open_map, open_scene
+from wheretolook.view.viewed_map import open_map, open_scene
 
 BASE = WEIGHTS / "set.safetensors"
 
 
-def save_adapted(path: Path, landmarks: np.ndarray) -> None:
+def save_adapted(path, landmarks):
     """Save weights adapted to the scene of these landmarks that halve all log-odds."""
     base = TrainedNetwork.load(BASE, SetNetwork, "set")
     network = AdaptedNetwork(base.network, base.scale, base.offset, 50)
@@ -34,15 +30,15 @@ def save_adapted(path: Path, landmarks: np.ndarray) -> None:
 
 
 @pytest.fixture
-def dataset(tmp_path: Path) -> Dataset:
+def dataset(tmp_path):
     return make_dataset(tmp_path / "rooms", ("train", "test"), n_locations=4, n_directions=5)
 
 
-def viewed(dataset: Dataset, scene: str, weights: Path | None = None) -> ViewedMap:
+def viewed(dataset, scene, weights=None):
     return open_scene(dataset.root.parent, scene, "", None, weights, "cpu")
 
 
-def test_adapted_weights_score_in_their_scene_only(dataset: Dataset) -> None:
+def test_adapted_weights_score_in_their_scene_only(dataset):
     path = dataset.root / "adapted" / "scene-1.safetensors"
     save_adapted(path, dataset.scene("scene-1").read_landmarks().points)
     shutil.copy(path, path.with_name("scene-0.safetensors"))  # of another scene
@@ -57,7 +53,7 @@ def test_adapted_weights_score_in_their_scene_only(dataset: Dataset) -> None:
     assert viewed(dataset, "scene-1").weights.methods[0] == "set"
 
 
-def test_weights_trained_with_a_dataset_score_its_scenes(dataset: Dataset) -> None:
+def test_weights_trained_with_a_dataset_score_its_scenes(dataset):
     own = dataset.root / "weights" / "set.safetensors"
     own.parent.mkdir()
     base = TrainedNetwork.load(BASE, SetNetwork, "set")
@@ -69,7 +65,7 @@ def test_weights_trained_with_a_dataset_score_its_scenes(dataset: Dataset) -> No
     assert viewed(dataset, "scene-1").weights.files["set"] != own
 
 
-def test_weights_adapted_to_a_map(tmp_path: Path) -> None:
+def test_weights_adapted_to_a_map(tmp_path):
     sparse = write_room(tmp_path / "house" / "sparse")
     save_adapted(tmp_path / "checks" / "house" / "adapted.safetensors", open_map(sparse).landmarks.points)
     assert open_map(sparse, data=tmp_path).weights.methods[0] == "adapted"
@@ -77,7 +73,7 @@ def test_weights_adapted_to_a_map(tmp_path: Path) -> None:
         open_map(sparse, weights=tmp_path / "nowhere.safetensors")
 
 
-def test_a_map_opens_before_torch_and_warp_are_loaded(tmp_path: Path) -> None:
+def test_a_map_opens_before_torch_and_warp_are_loaded(tmp_path):
     code = (
         "import sys; from pathlib import Path; from wheretolook.view.viewed_map import open_map; "
         "import wheretolook.view.server, wheretolook.view.page; open_map(Path(sys.argv[1])); "

@@ -1,10 +1,7 @@
 """The worker's priorities and the level of detail of slow browsers."""
 
-from __future__ import annotations
-
 import threading
 import time
-from collections.abc import Iterator
 
 import numpy as np
 import pytest
@@ -13,13 +10,13 @@ from waiting import wait_until
 from wheretolook.view.session import LATER, NOW, SOON, Worker
 
 
-def test_urgent_jobs_go_first_and_failures_stop_nothing_else() -> None:
+def test_urgent_jobs_go_first_and_failures_stop_nothing_else():
     worker = Worker()
-    done: list[str] = []
-    errors: list[Exception] = []
+    done = []
+    errors = []
     ready = threading.Event()
 
-    def steps(name: str, n: int) -> Iterator[None]:
+    def steps(name, n):
         ready.wait(10)
         for _ in range(n):
             done.append(name)
@@ -27,12 +24,10 @@ def test_urgent_jobs_go_first_and_failures_stop_nothing_else() -> None:
         if name == "fails":
             raise ValueError
 
-    worker.submit(1, "floor", LATER, steps("first", 3), errors.append)
-    worker.submit(2, "floor", LATER, steps("second", 2), errors.append)
-    worker.submit(3, "floor", LATER, steps("fails", 1), errors.append)
-    worker.submit(1, "view", NOW, steps("replaced", 5), errors.append)
-    worker.submit(1, "view", NOW, steps("new", 2), errors.append)
-    worker.submit(4, "floor", LATER, steps("forgotten", 5), errors.append)
+    for client, name, n in ((1, "first", 3), (2, "second", 2), (3, "fails", 1), (4, "forgotten", 5)):
+        worker.submit(client, "floor", LATER, steps(name, n), errors.append)
+    for name in ("replaced", "new"):
+        worker.submit(1, "view", NOW, steps(name, 2), errors.append)
     worker.forget(4)
     ready.set()
     wait_until(lambda: len(done) >= 8 and errors)
@@ -41,20 +36,20 @@ def test_urgent_jobs_go_first_and_failures_stop_nothing_else() -> None:
     assert done.index("new") <= 1 and isinstance(errors[0], ValueError)
 
 
-def test_no_urgency_starves(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_urgency_starves(monkeypatch):
     """Floors wait while a view is turned without end, but not for ever; nor do clicked locations."""
     monkeypatch.setattr("wheretolook.view.session.PATIENCE_S", 0.6)
     monkeypatch.setattr("wheretolook.view.session.CLICK_PATIENCE_S", 0.2)
     worker = Worker()
-    floors: list[float] = []
-    clicks: list[float] = []
+    floors = []
+    clicks = []
 
-    def turns() -> Iterator[None]:
+    def turns():
         while True:
             time.sleep(0.01)
             yield
 
-    def note(times: list[float]) -> Iterator[None]:
+    def note(times):
         times.append(time.monotonic())
         yield
 
@@ -62,6 +57,6 @@ def test_no_urgency_starves(monkeypatch: pytest.MonkeyPatch) -> None:
     for n in (1, 2):
         worker.submit(2, "place", SOON, note(clicks), pytest.fail)
         worker.submit(2, "floor", LATER, note(floors), pytest.fail)
-        wait_until(lambda n=n: len(clicks) == len(floors) == n, 10)  # type: ignore[misc]
+        wait_until(lambda n=n: len(clicks) == len(floors) == n, 10)
     worker.stop()
     assert np.diff(floors)[0] >= 0.6

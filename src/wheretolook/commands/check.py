@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from wheretolook.commands.options import LabelOptions, OcclusionOptions, ScorerOptions
+from wheretolook.commands.options import LabelOptions, ScorerOptions
 from wheretolook.dataset.config import LOCK, checked_accuracy
 from wheretolook.dataset.layout import find_scene
 from wheretolook.dataset.scene import ColmapFiles, Scene
@@ -69,7 +69,7 @@ def hold_out_photographs(
 
 
 @dataclass(frozen=True, kw_only=True)
-class Check(OcclusionOptions, ScorerOptions, FrameOptions):
+class Check(ScorerOptions, FrameOptions):
     """Check how well scores separate good from bad views of your own map, by its own photographs.
 
     Blocks of neighbouring photographs are held out of the map, and localized against what remains. The model's poses

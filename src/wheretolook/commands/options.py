@@ -301,24 +301,13 @@ class CameraOptions(Command):
 
 
 @dataclass(frozen=True, kw_only=True)
-class OcclusionOptions(Command):
-    """What occludes landmarks.
+class ScorerOptions(Command):
+    """How views are scored.
 
     Args:
         mesh: a mesh of the scene (GLB, OBJ, PLY) in the map's frame.
         occlusion: mesh, tsdf (depth images), hidden-points (from the landmarks alone) or none; by default the first of
             these that there is data for.
-    """
-
-    mesh: Path | None = None
-    occlusion: str | None = None
-
-
-@dataclass(frozen=True, kw_only=True)
-class ScorerOptions(Command):
-    """How views are scored.
-
-    Args:
         weights: file or folder of weights; by default the bundled ones.
         method: a name of `wheretolook evaluate --list-methods`; by default that of the weights.
         accuracy: limits of the errors in metres and degrees that scores refer to; by default those of the weights,
@@ -326,6 +315,8 @@ class ScorerOptions(Command):
         anywhere: allow weights adapted to another scene.
     """
 
+    mesh: Path | None = None
+    occlusion: str | None = None
     weights: Path | None = None
     method: str = ""
     accuracy: tuple[float, float] | None = None

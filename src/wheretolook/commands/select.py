@@ -9,7 +9,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
-from wheretolook.commands.options import CameraOptions, OcclusionOptions, ScorerOptions
+from wheretolook.commands.options import CameraOptions, ScorerOptions
 from wheretolook.dataset.config import checked_accuracy
 from wheretolook.figures import KINDS
 from wheretolook.geometry.camera import PinholeCamera, describe_camera, parse_size
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
-class SelectorOptions(CameraOptions, OcclusionOptions, ScorerOptions, FrameOptions):
+class SelectorOptions(CameraOptions, ScorerOptions, FrameOptions):
     """A COLMAP model, and how its views are scored.
 
     Args:

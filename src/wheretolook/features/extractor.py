@@ -127,7 +127,7 @@ SUPERPOINT = DescriptorKind("superpoint", 256, "float16", min_similarity=0.755)
 KINDS = {kind.name: kind for kind in (SIFT, ALIKED, DISK, XFEAT, SUPERPOINT)}
 
 EXTRACTORS = {
-    "opencv": Extractor("opencv", SIFT, "sift:opencv_or_gpu"),
+    "opencv": Extractor("opencv", SIFT, "sift:OpenCvSift"),
     "colmap": Extractor("colmap", SIFT, "sift:ColmapSift"),
     "aliked": Extractor(
         "aliked",

@@ -2,29 +2,34 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from wheretolook.features.extractor import Extraction, ExtractorConfig, Keypoints, check_image, unit_descriptors
+from wheretolook.features.extractor import ExtractorConfig, Keypoints, check_image, unit_descriptors
 from wheretolook.features.opencv_sift import RootSift
 from wheretolook.utils.texts import quiet_colmap
 
 
 class OpenCvSift:
-    """OpenCV's SIFT on one CPU core."""
+    """OpenCV's SIFT on one CPU core; on a CUDA device by Warp kernels."""
 
-    batch = 1
+    def __init__(self, config: ExtractorConfig, device: str) -> None:
+        if device == "cpu":
+            self.batch = 1
+            self._extract: Callable[[NDArray[np.uint8]], list[Keypoints]] = RootSift(config).extract_many
+        else:
+            from wheretolook.features.warp_sift import WarpSift
 
-    def __init__(self, config: ExtractorConfig) -> None:
-        self._sift = RootSift(config)
+            self.batch = 8
+            self._extract = WarpSift(config, device).extract_many
 
     def extract_batch(self, images: Sequence[NDArray[np.uint8]]) -> list[Keypoints]:
-        """Keypoints of images (H, W, 3) uint8, those of most contrast first."""
-        return [self._sift.extract(grey_bitmap(rgb).to_array()) for rgb in images]
+        """Keypoints of images (H, W, 3) uint8 of one size, those of most contrast first."""
+        return self._extract(np.stack([grey_bitmap(rgb).to_array() for rgb in images]))
 
 
 class ColmapSift:
@@ -57,27 +62,7 @@ class ColmapSift:
         return Keypoints(table[keep, :2], unit_descriptors(descriptors.data[keep]))
 
 
-class GpuSift:
-    """OpenCV's SIFT by Warp kernels, on a CUDA device."""
-
-    batch = 8
-
-    def __init__(self, config: ExtractorConfig, device: str) -> None:
-        from wheretolook.features.warp_sift import WarpSift
-
-        self._sift = WarpSift(config, device)
-
-    def extract_batch(self, images: Sequence[NDArray[np.uint8]]) -> list[Keypoints]:
-        """Keypoints of images (H, W, 3) uint8 of one size, those of most contrast first."""
-        return list(self._sift.extract_many(np.stack([grey_bitmap(rgb).to_array() for rgb in images])))
-
-
 def grey_bitmap(rgb: NDArray[np.uint8]) -> Any:
     """Convert to grey as COLMAP does (Rec. 709 weights); with other weights other keypoints pass the thresholds."""
     check_image(rgb)
     return pycolmap.Bitmap.from_array(np.ascontiguousarray(rgb)).clone_as_grey()
-
-
-def opencv_or_gpu(config: ExtractorConfig, device: str) -> Extraction:
-    """Return OpenCV's SIFT on a CPU core, or by Warp kernels on a CUDA device."""
-    return OpenCvSift(config) if device == "cpu" else GpuSift(config, device)

@@ -113,12 +113,13 @@ class _SceneInProgress:
         table = task.table
         if table.empty:
             raise TableError("no viewpoints to label", value=task.name, fix="Run the sample stage with other settings.")
+        device = job.device.partition(":")[0]
         settings: dict[str, Any] = {
             "versions": versions(),
             "localizer": job.localizer.record(),
             "extractor": job.extractor.record(),
             "camera": job.camera.record(),
-            "renderer": _renderer_name(job.device),
+            "renderer": f"{device} {method_on(device)}",  # which round some pixels differently
             "mesh": fingerprint(job.mesh),
             "landmarks": fingerprint(job.landmarks),
         }
@@ -150,12 +151,6 @@ class _SceneInProgress:
         table = pd.concat([_read(shard) for shard in self.shards], ignore_index=True)
         contents = {shard.path.name: {"n": len(shard.rows), "sha256": sha256(shard.path)} for shard in self.shards}
         return LabelledScene(self.task, table, {**self.manifest, "shards": contents}, self.seconds)
-
-
-def _renderer_name(device: str) -> str:
-    """Kind of device and rendering method, which round some pixels differently."""
-    kind = device.partition(":")[0]
-    return f"{kind} {method_on(kind)}"
 
 
 def _run(shards: Sequence[Shard], config: LabelConfig) -> Generator[tuple[Shard, LabelledShard], None, None]:

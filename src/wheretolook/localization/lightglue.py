@@ -138,11 +138,14 @@ def _network(features: str, weights: str) -> Any:
 
     def prepare(state: dict[str, Any]) -> dict[str, Any]:
         """Rename the authors' keys to kornia's; XFeat's file holds its extractor, too, which is dropped."""
-        names = {
-            key: re.sub(r"^(?:matcher\.)?(self_attn|cross_attn)\.(\d+)", r"transformers.\2.\1", key) for key in state
-        }
-        renamed = {names[key].removeprefix("matcher."): value for key, value in state.items()}
-        return {key: value for key, value in renamed.items() if key in network.state_dict()}
+        known = network.state_dict()
+        renamed = {}
+        for key, value in state.items():
+            name = re.sub(r"^(?:matcher\.)?(self_attn|cross_attn)\.(\d+)", r"transformers.\2.\1", key)
+            name = name.removeprefix("matcher.")
+            if name in known:
+                renamed[name] = value
+        return renamed
 
     file = "" if weights == "kornia" else weights
     load_state(network, file, name, [url], prepare, "--label.localizer.lightglue (of localize --lightglue)")

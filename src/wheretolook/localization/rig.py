@@ -151,8 +151,10 @@ def _rows_of(table: NamedRows, images: Sequence[PurePath]) -> list[int]:
     """Return the row of each image: by name, by time, or in order."""
     is_named = any(name in table.columns for name in NAME_COLUMNS) and len({*table.names}) == len(table.names)
     rows = {name: row for row, name in enumerate(table.names)} if is_named else {}
-    ends = [[*path_ends(path), path.stem] for path in images]
-    found = [next((rows[name] for name in names if name in rows), None) for names in ends]
+    found: list[int | None] = []
+    for path in images:
+        named = [rows[name] for name in (*path_ends(path), path.stem) if name in rows]
+        found.append(named[0] if named else None)
     if None in found and is_named:
         found = _rows_by_time(table, images) or found
     in_order = "image" not in table.columns and len(table.names) == len(images)

@@ -28,7 +28,7 @@ from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.rendering.appearance import Appearance
 from wheretolook.rendering.warp_renderer import Renderer, WarpRenderer
 from wheretolook.scenes.loading import load_mesh
-from wheretolook.utils.devices import halving
+from wheretolook.utils.devices import run_halving
 from wheretolook.utils.errors import WhereToLookError, WorkerError
 from wheretolook.utils.processes import WorkerPool, worker_number
 
@@ -266,15 +266,15 @@ class _BatchLabeller:
         self.localizer = localizer
 
     def render(self, batch: _Batch) -> tuple[_Batch, Sequence[NDArray[np.uint8]]]:
-        return batch, halving(lambda views: _images(batch, views))(np.arange(len(batch.rows)))
+        return batch, run_halving(lambda views: _images(batch, views), np.arange(len(batch.rows)))
 
     def extract(self, rendered: tuple[_Batch, Sequence[NDArray[np.uint8]]]) -> tuple[_Batch, list[Keypoints]]:
         batch, images = rendered
-        return batch, halving(self.localizer.extractor.extract_batch)(images)
+        return batch, run_halving(self.localizer.extractor.extract_batch, images)
 
     def match(self, extracted: tuple[_Batch, list[Keypoints]]) -> tuple[_Batch, list[Keypoints], list[Matches]]:
         batch, keypoints = extracted
-        return batch, keypoints, halving(lambda some: self.localizer.match(some, batch.camera))(keypoints)
+        return batch, keypoints, run_halving(lambda some: self.localizer.match(some, batch.camera), keypoints)
 
     def estimate(self, matched: tuple[_Batch, list[Keypoints], list[Matches]]) -> list[Localization]:
         batch, keypoints, matches = matched

@@ -212,14 +212,12 @@ class RobotLocalizer:
         joint = self._localizer.localize(looks, [view.poses[:count] + view.near_prior for view in views])
         found = zip((joint, *joint.rivals), probabilities(joint, limits), strict=True)
         to_map = self._world_from_map.inverse.apply_to_poses
-        return RobotLocalization(
-            joint,
-            tuple(
-                RobotPose(to_map(pose.rig_from_world), float(probability), pose.n_inliers, self._covariance(pose))
-                for pose, probability in found
-                if pose.rig_from_world is not None
-            ),
-        )
+        in_map = []
+        for pose, probability in found:
+            if pose.rig_from_world is not None:
+                cam_from_map = to_map(pose.rig_from_world)
+                in_map.append(RobotPose(cam_from_map, float(probability), pose.n_inliers, self._covariance(pose)))
+        return RobotLocalization(joint, tuple(in_map))
 
     def next_look(
         self,

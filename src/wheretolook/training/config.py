@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import inf
 from typing import Literal
 
-from wheretolook.utils.errors import ConfigError, no_option
+from wheretolook.utils.errors import check_choice, check_positive, check_range, check_share, no_option
 
 Schedule = Literal["constant", "cosine"]
 Keep = Literal["best", "last"]
@@ -40,10 +39,12 @@ class SharedConfig:
     devices: int = 1
 
     def __post_init__(self) -> None:
-        check_choice(self, "accelerator", "auto", "cpu", "gpu")
-        check_range(self, "max_error_m", "max_error_deg", above=0)
-        check_range(self, "devices", at_least=1)
-        check_range(self, "val_fraction", above=0, below=1)
+        check_choice("accelerator", self.accelerator, ("auto", "cpu", "gpu"))
+        check_positive("max_error_m", self.max_error_m)
+        check_positive("max_error_deg", self.max_error_deg)
+        check_range("devices", self.devices, 1)
+        check_share("val_fraction", self.val_fraction)
+        check_positive("val_fraction", self.val_fraction)
 
 
 DECIDING = ("max_error_m", "max_error_deg", "val_fraction", "seed")
@@ -70,9 +71,10 @@ class FittingConfig:
     l2: float = no_option(1e-5)
 
     def __post_init__(self) -> None:
-        check_range(self, "epochs", "batch_size", at_least=1)
-        check_range(self, "learning_rate", above=0)
-        check_range(self, "l2", at_least=0)
+        check_range("epochs", self.epochs, 1)
+        check_range("batch_size", self.batch_size, 1)
+        check_positive("learning_rate", self.learning_rate)
+        check_range("l2", self.l2, 0)
 
     @property
     def schedule(self) -> Schedule:
@@ -98,19 +100,3 @@ class FittingConfig:
     def starts_from(self) -> str:
         """Name of the method whose weights in the dataset's folder, if there are any, training starts from."""
         return ""
-
-
-def check_range(options: object, *names: str, at_least: float = -inf, above: float = -inf, below: float = inf) -> None:
-    """Raise a ConfigError unless these options are within the bounds."""
-    for name in names:
-        value = getattr(options, name)
-        if not (value >= at_least and above < value < below):
-            bounds = {"at least": at_least, "above": above, "below": below}
-            text = " and ".join(f"{word} {bound:g}" for word, bound in bounds.items() if abs(bound) < inf)
-            raise ConfigError(f"{name} must be {text}", value=value)
-
-
-def check_choice(options: object, name: str, *choices: str) -> None:
-    """Raise a ConfigError unless an option is one of some words."""
-    if getattr(options, name) not in choices:
-        raise ConfigError(f"unknown {name}", value=getattr(options, name), fix=f"Use {' or '.join(choices)}.")

@@ -126,6 +126,12 @@ def check_range(name: str, value: float, low: float, high: float = inf) -> None:
         raise ConfigError(f"{name} must be {limits}", value=value)
 
 
+def check_share(name: str, value: float) -> None:
+    """Raise ConfigError unless a number is at least 0 and below 1."""
+    if not 0 <= value < 1:
+        raise ConfigError(f"{name} must be at least 0 and below 1", value=value)
+
+
 def check_limits(name: str, limits: Any) -> tuple[float, float]:
     """Return two numbers, the lowest and the highest. Raises ConfigError for anything else."""
     try:

@@ -59,26 +59,6 @@ def _lock_bytes(file: int, shared: bool) -> None:
     raise BlockingIOError
 
 
-def signal_main_thread(number: int) -> None:
-    """Send a signal to the main thread, which wakes it from system calls (not on Windows)."""
-    if hasattr(signal, "pthread_kill"):
-        signal.pthread_kill(threading.main_thread().ident or 0, number)
-    else:
-        _thread.interrupt_main(signal.Signals(number))
-
-
-def hold_back(number: int, held: bool) -> None:
-    """Hold a signal back from this thread, or release it; on Windows signals are not held back."""
-    if hasattr(signal, "pthread_sigmask"):
-        signal.pthread_sigmask(signal.SIG_BLOCK if held else signal.SIG_UNBLOCK, [number])
-
-
-def end_with_starting_thread() -> None:
-    """Let Linux kill this process when the thread that started it ends, whatever this process does (prctl(2))."""
-    with suppress(OSError, AttributeError, TypeError):  # TypeError: Windows has no library without a name
-        ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG of sys/prctl.h
-
-
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
@@ -196,12 +176,16 @@ def ignoring_sigint() -> Iterator[None]:
 
 def on_sigterm(handler: Any) -> None:
     """Set the handler of SIGTERM in the main thread, in place of COLMAP's own, which prints a native stack."""
-    if in_main_thread():
-        hold_back(signal.SIGTERM, True)
-        import pycolmap  # noqa: F401
+    if not in_main_thread():
+        return
+    can_hold_back = hasattr(signal, "pthread_sigmask")  # not on Windows
+    if can_hold_back:
+        signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGTERM])
+    import pycolmap  # noqa: F401
 
-        signal.signal(signal.SIGTERM, handler)
-        hold_back(signal.SIGTERM, False)
+    signal.signal(signal.SIGTERM, handler)
+    if can_hold_back:
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGTERM])
 
 
 def interrupt(number: int, frame: FrameType | None) -> None:
@@ -216,7 +200,10 @@ def interrupt(number: int, frame: FrameType | None) -> None:
 
 def _send_later(number: int) -> None:
     time.sleep(0.05)
-    signal_main_thread(number)
+    if hasattr(signal, "pthread_kill"):  # which wakes the main thread from system calls; not on Windows
+        signal.pthread_kill(threading.main_thread().ident or 0, number)
+    else:
+        _thread.interrupt_main(signal.Signals(number))
 
 
 def in_main_thread() -> bool:
@@ -241,7 +228,8 @@ def _start_worker(numbers: Any, stopped: Connection, started_by_main_thread: boo
     """
     global _number
     if started_by_main_thread:
-        end_with_starting_thread()
+        with suppress(OSError, AttributeError, TypeError):  # TypeError: Windows has no library without a name
+            ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG of sys/prctl.h
     threading.Thread(target=_exit_when_stopped, args=(stopped,), daemon=True).start()
     _number = numbers.get()
     on_sigterm(signal.SIG_DFL)

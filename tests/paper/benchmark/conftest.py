@@ -1,10 +1,7 @@
 """A scene folder in the benchmark's layout, of a generated room: drawn and mapped as the benchmark's scripts do it."""
 
-from __future__ import annotations
-
 import shutil
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -22,7 +19,7 @@ from wheretolook_paper.benchmark.round import build_query_map
 IDS = (*map(str, range(1, 13)),)  # file names sort differently: 1, 10, 11, 12, 2
 
 
-def make_scene(folder: Path) -> Path:
+def make_scene(folder):
     """00010-room: a room with one plain wall, 30 images of 320 x 320 px, 12 waypoints 0.2 m apart."""
     scene = folder / "00010-room"
     images = scene / "scene_reconstruction" / "images"
@@ -56,5 +53,5 @@ def make_scene(folder: Path) -> Path:
 
 
 @pytest.fixture(scope="session")
-def scene_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def scene_folder(tmp_path_factory):
     return make_scene(tmp_path_factory.mktemp("benchmark"))

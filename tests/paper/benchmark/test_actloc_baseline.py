@@ -1,7 +1,5 @@
 """The released baseline, against its definition in plain loops."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -11,7 +9,7 @@ from wheretolook.utils.errors import MapError
 from wheretolook_paper.benchmark.actloc_baseline import actloc_views
 
 
-def definition(points: np.ndarray, place: np.ndarray) -> np.ndarray:
+def definition(points, place):
     """The orientation (3, 3) in the world that it returns."""
     best = (-60, -180)
     most = -1
@@ -29,7 +27,7 @@ def definition(points: np.ndarray, place: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
-def test_views_are_those_of_the_definition(seed: int) -> None:
+def test_views_are_those_of_the_definition(seed):
     rng = np.random.default_rng(seed)
     points = rng.uniform((-4, -4, -1), (4, 4, 3), (150, 3))
     places = rng.uniform(-1, 1, (3, 3))
@@ -39,6 +37,6 @@ def test_views_are_those_of_the_definition(seed: int) -> None:
         np.testing.assert_allclose(pose[:, :3].T, definition(points, place), atol=1e-12)
 
 
-def test_a_map_without_landmarks() -> None:
+def test_a_map_without_landmarks():
     with pytest.raises(MapError):
         actloc_views(np.zeros((0, 3)), np.zeros((1, 3)))

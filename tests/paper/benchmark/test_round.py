@@ -1,7 +1,5 @@
 """The whole round on a small scene: select, render, localize, score; and which steps a second run repeats."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 
@@ -17,7 +15,7 @@ from wheretolook.cli import main
 from wheretolook.geometry.poses import camera_centers, pose_error
 from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.scenes.loading import load_mesh
-from wheretolook.utils.errors import MapError, SceneError, TableError, WhereToLookError
+from wheretolook.utils.errors import MapError, SceneError, TableError
 from wheretolook_paper.benchmark.files import DRAWN_CAMERA, BenchmarkScene, read_errors, read_poses
 from wheretolook_paper.benchmark.round import RoundConfig, SceneRound
 
@@ -26,29 +24,29 @@ pytestmark = pytest.mark.slow
 METHODS = ("best", "max-visibility", "max-visibility-shipped")
 
 
-def benchmark(scene: Path, out: Path, *options: str) -> int:
+def benchmark(scene, out, *options):
     shared = ["--workers", "1", "--device", "cpu", "--directions", "60"]
     return main(["benchmark", str(scene), "--out", str(out), *shared, *options])
 
 
 @pytest.fixture(scope="module")
-def out(scene_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def out(scene_folder, tmp_path_factory):
     folder = tmp_path_factory.mktemp("out")
     assert benchmark(scene_folder, folder) == 0
     return folder
 
 
 @pytest.fixture
-def copied(out: Path, tmp_path: Path) -> Path:
+def copied(out, tmp_path):
     return Path(shutil.copytree(out, tmp_path / "out"))
 
 
-def times(folder: Path) -> dict[str, int]:
+def times(folder):
     return {str(path.relative_to(folder)): path.stat().st_mtime_ns for path in folder.rglob("*") if path.is_file()}
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_files_and_summary_of_a_method(method: str, out: Path, scene_folder: Path) -> None:
+def test_files_and_summary_of_a_method(method, out, scene_folder):
     folder = out / scene_folder.name / method
     poses = read_poses(folder / "selected_gt_poses.txt")
     errors = read_errors(folder / "pose_errors.txt")
@@ -58,29 +56,24 @@ def test_files_and_summary_of_a_method(method: str, out: Path, scene_folder: Pat
     drawn = WarpRenderer(load_mesh(scene_folder / "room.glb")).render(DRAWN_CAMERA, poses.cam_from_world[[4]]).rgb[0]
     np.testing.assert_array_equal(cv2.imread(str(folder / "images" / "5.png"))[:, :, ::-1], drawn)
     estimates = read_poses(folder / "estimate_poses.txt")
-    metres, degrees = pose_error(
-        estimates.cam_from_world, poses.cam_from_world[[poses.ids.index(name) for name in estimates.ids]]
-    )
+    truth = poses.cam_from_world[[poses.ids.index(name) for name in estimates.ids]]
     rows = [errors.ids.index(name) for name in estimates.ids]
-    assert_allclose(errors.metres[rows], metres, atol=1e-9)
-    assert_allclose(errors.degrees[rows], degrees, atol=1e-6)
-    summary = pd.read_csv(out / "summary.csv")
-    summary = summary[summary["method"] == method]
+    assert_allclose([errors.metres[rows], errors.degrees[rows]], pose_error(estimates.cam_from_world, truth), atol=1e-6)
+    summary = pd.read_csv(out / "summary.csv").query("method == @method")
     shipped = [*zip(summary["as_shipped_hits"], summary["as_shipped_total"], strict=True)]
     paths = folder / "pose_errors.txt", folder / "selected_gt_poses.txt"
     assert shipped == [*loc_as_released(paths[0]), plan_as_released(*paths)]
-    views = pd.read_csv(out / "views.csv", dtype={"id": str})
-    views = views[views["method"] == method]
+    views = pd.read_csv(out / "views.csv", dtype={"id": str}).query("method == @method")
     assert [*summary["mended_hits"]] == [views[measure].sum() for measure in summary["measure"]]
 
 
-def test_best_views_localize_more_often_than_the_released_baseline(out: Path) -> None:
+def test_best_views_localize_more_often_than_the_released_baseline(out):
     summary = pd.read_csv(out / "summary.csv").set_index(["method", "measure"])["mended_hits"]
     assert summary["best", "0.05m_0.4deg"] >= 10
     assert summary["max-visibility-shipped", "0.25m_2deg"] < summary["max-visibility", "0.25m_2deg"]
 
 
-def test_a_second_run_does_only_what_is_missing(copied: Path, scene_folder: Path) -> None:
+def test_a_second_run_does_only_what_is_missing(copied, scene_folder):
     before = times(copied)
     assert benchmark(scene_folder, copied) == 0
     reports = {"summary.csv", "summary.md", "views.csv"}
@@ -98,7 +91,7 @@ def test_a_second_run_does_only_what_is_missing(copied: Path, scene_folder: Path
     assert redone <= changed <= redone | reports | {"made-from.json"}
 
 
-def test_other_options_replace_the_selection(copied: Path, scene_folder: Path, tmp_path: Path) -> None:
+def test_other_options_replace_the_selection(copied, scene_folder, tmp_path):
     few = tmp_path / "few.txt"
     few.write_text("# id x y z\nb 2.5 2.0 1.3\na 2.6 2.0 1.3\n")
     assert benchmark(scene_folder, copied, "--methods", "max-visibility-shipped", "--waypoints", str(few)) == 0
@@ -110,9 +103,7 @@ def test_other_options_replace_the_selection(copied: Path, scene_folder: Path, t
     assert {*views["method"]} == {"best-turn12"} and views["turn_deg"].max() <= 12 + 1e-5
 
 
-def test_the_benchmarks_own_script_can_localize(
-    scene_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_benchmarks_own_script_can_localize(scene_folder, tmp_path, capsys):
     options = ("--methods", "visible", "--localizer", "none")
     assert benchmark(scene_folder, tmp_path, *options) == 0
     errors = tmp_path / scene_folder.name / "visible" / "pose_errors.txt"
@@ -135,7 +126,7 @@ def test_the_benchmarks_own_script_can_localize(
         ("scene_reconstruction/images/00003.png", MapError),
     ],
 )
-def test_missing_files(missing: str, error: type[WhereToLookError], scene_folder: Path, tmp_path: Path) -> None:
+def test_missing_files(missing, error, scene_folder, tmp_path):
     scene = Path(shutil.copytree(scene_folder, tmp_path / scene_folder.name))
     (scene / missing).unlink()
     with pytest.raises(error):
@@ -143,5 +134,5 @@ def test_missing_files(missing: str, error: type[WhereToLookError], scene_folder
 
 
 @pytest.mark.parametrize("arguments", [(), ("--errors", "e.txt"), ("a", "--lattice", "x"), ("a", "a"), ("nowhere",)])
-def test_invalid_options(arguments: tuple[str, ...]) -> None:
+def test_invalid_options(arguments):
     assert main(["benchmark", *arguments]) == 2

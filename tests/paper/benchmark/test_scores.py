@@ -1,14 +1,9 @@
 """Both measures against numbers worked out by hand, and against the released scripts said again in plain loops."""
 
-from __future__ import annotations
-
 import math
-from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.utils.errors import TableError
@@ -31,18 +26,18 @@ ERRORS = {  # metres and degrees of each id
 }
 
 
-def write_case(folder: Path, ids: list[str], errors: dict[str, tuple[float, float]], yaws: tuple[float, ...]) -> Path:
+def write_case(folder, ids, errors, yaws):
     axes = [(math.cos(math.radians(yaw)), math.sin(math.radians(yaw)), 0) for yaw in yaws]
     write_poses(folder / "selected_gt_poses.txt", ids, poses_looking_along(np.zeros((len(ids), 3)), axes))
     write_errors(folder / "pose_errors.txt", list(errors), *np.array(list(errors.values())).T)
     return folder
 
 
-def scores_of(folder: Path) -> Scores:
+def scores_of(folder):
     return Scores.of(read_poses(folder / "selected_gt_poses.txt"), read_errors(folder / "pose_errors.txt"))
 
 
-def loc_as_released(errors: Path) -> list[tuple[int, int]]:
+def loc_as_released(errors):
     """evaluate_loc.py, said again: lines of three words count; limits inclusive; over the number of lines."""
     lines = [line.split() for line in errors.read_text().splitlines()]
     pairs = [(float(line[1]), float(line[2])) for line in lines if len(line) == 3]
@@ -50,27 +45,24 @@ def loc_as_released(errors: Path) -> list[tuple[int, int]]:
     return [(sum(m <= most_m and d <= most_d for m, d in pairs), len(pairs)) for most_m, most_d in limits]
 
 
-def plan_as_released(errors: Path, poses: Path) -> tuple[int, int] | None:
+def plan_as_released(errors, poses):
     """evaluate_plan.py, said again: the n-th error with the n-th pose; it stops if their numbers differ."""
     lines = [line.split() for line in errors.read_text().splitlines()]
     pairs = [(float(line[1]), float(line[2])) for line in lines if len(line) == 3]
-    rows = [line.split() for line in poses.read_text().splitlines() if not line.startswith("#")]
-    quaternions = [[float(cell) for cell in row[1:5]] for row in rows if len(row) == 8]
+    quaternions = np.loadtxt(poses, dtype=str, ndmin=2)[:, 1:5].astype(float)
     if len(pairs) != len(quaternions):
         return None
-    turns = [0.0]
-    for before, after in pairwise(quaternions):
-        cosine = abs(sum(a * b for a, b in zip(before, after, strict=True)))
-        turns.append(math.degrees(2 * math.acos(min(1.0, cosine))))
+    cosines = np.abs((quaternions[1:] * quaternions[:-1]).sum(1)).clip(max=1)
+    turns = [0.0, *np.degrees(2 * np.arccos(cosines))]
     good = [m <= 0.25 and d <= 2 and turn <= 30 for (m, d), turn in zip(pairs, turns, strict=True)]
     return sum(good), len(pairs)
 
 
-def hits(counted: NDArray[np.bool_]) -> tuple[int, int]:
+def hits(counted):
     return int(counted.sum()), len(counted)
 
 
-def test_numbers_worked_out_by_hand(tmp_path: Path) -> None:
+def test_numbers_worked_out_by_hand(tmp_path):
     scores = scores_of(write_case(tmp_path, list(ERRORS), ERRORS, YAWS))
     # ids within each limit: 1 4 10; and 2 3 5; and 6; and 7
     expected = {"0.05m_0.4deg": 3, "0.25m_2deg": 6, "0.5m_5deg": 7, "5m_10deg": 8, PLAN: 5}
@@ -85,7 +77,7 @@ def test_numbers_worked_out_by_hand(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_as_shipped_is_what_the_scripts_compute(seed: int, tmp_path: Path) -> None:
+def test_as_shipped_is_what_the_scripts_compute(seed, tmp_path):
     rng = np.random.default_rng(seed)
     n = int(rng.integers(2, 40))
     ids = [str(number) for number in rng.permutation(n)]
@@ -108,7 +100,7 @@ def test_as_shipped_is_what_the_scripts_compute(seed: int, tmp_path: Path) -> No
     assert mended == [*loc_as_released(lines), plan_as_released(lines, poses)]
 
 
-def test_files_of_the_benchmarks_own_script(tmp_path: Path) -> None:
+def test_files_of_the_benchmarks_own_script(tmp_path):
     """It writes the image's name where it found no pose, strips p, n, g and dots off others, and ends lines so."""
     poses = poses_looking_along(np.zeros((3, 3)), np.tile([1.0, 0, 0], (3, 1)))
     write_poses(tmp_path / "selected_gt_poses.txt", ["7", "gap", "12"], poses)
@@ -116,7 +108,7 @@ def test_files_of_the_benchmarks_own_script(tmp_path: Path) -> None:
     np.testing.assert_array_equal(scores_of(tmp_path).metres, [np.nan, 0.3, 0.01])
 
 
-def test_a_pose_without_an_error_has_failed_and_the_script_stops(tmp_path: Path) -> None:
+def test_a_pose_without_an_error_has_failed_and_the_script_stops(tmp_path):
     few = {name: ERRORS[name] for name in ("1", "2", "4")}
     whole = Result("a", "m", scores_of(write_case(tmp_path, ["1"], {"1": (0.01, 0.1)}, (0,))))
     summary = summary_table([whole, Result("b", "m", scores_of(write_case(tmp_path, list(ERRORS), few, YAWS)))])
@@ -134,7 +126,7 @@ def test_a_pose_without_an_error_has_failed_and_the_script_stops(tmp_path: Path)
 @pytest.mark.parametrize(
     "text", ["1 0.1 0.1\n1 0.2 0.2\n", "1 0.1\n", "1 0.1 x\n", "# a comment\n", "1 0.1 0.1\n99 0.1 0.1\n"]
 )
-def test_invalid_errors(text: str, tmp_path: Path) -> None:
+def test_invalid_errors(text, tmp_path):
     write_case(tmp_path, ["1"], {"1": (0.1, 0.1)}, (0,))
     (tmp_path / "pose_errors.txt").write_text(text)
     with pytest.raises(TableError):

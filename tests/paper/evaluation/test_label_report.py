@@ -1,21 +1,19 @@
 """Statistics of labels for reports, compared with numbers computed by hand on small tables."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
 from labelled_tables import HALL, NAN, SHED, SPLITS
 from wheretolook.dataset.viewpoint_table import POSITIVE, pooled_labels
-from wheretolook_paper.evaluation.label_report import LabelSummary, label_markdown, label_summary
+from wheretolook_paper.evaluation.label_report import label_markdown, label_summary
 
 
 @pytest.fixture
-def summary() -> LabelSummary:
+def summary():
     return label_summary(pooled_labels({"hall": HALL, "shed": SHED}, SPLITS))
 
 
-def test_report_of_both_localizers() -> None:
+def test_report_of_both_localizers():
     """By the first RANSAC result one view less is right in the shed; it is left out if a scene lacks these labels."""
     names = ("status", "error_m", "error_deg")
     hall, shed = (scene.assign(**{f"first_{name}": scene[name] for name in names}) for scene in (HALL, SHED))
@@ -29,7 +27,7 @@ def test_report_of_both_localizers() -> None:
     assert mixed == alone
 
 
-def test_bands_by_hand(summary: LabelSummary) -> None:
+def test_bands_by_hand(summary):
     height = summary.by_height
     np.testing.assert_allclose(height["low"], [0, 0.5, 1, 1.5, 2, 2.5, 3])  # above the lowest of each scene
     np.testing.assert_allclose(height["high"], height["low"] + 0.5)

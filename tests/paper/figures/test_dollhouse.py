@@ -1,7 +1,5 @@
 """Views of a scene from outside: projection, visibility of points, errors."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -9,7 +7,7 @@ from box_scenes import CABINET, ROOM, furnished_room
 from wheretolook_paper.figures.dollhouse import dollhouse
 
 
-def test_a_plan_has_x_to_the_right_and_y_up_and_knows_what_is_visible() -> None:
+def test_a_plan_has_x_to_the_right_and_y_up_and_knows_what_is_visible():
     plan = dollhouse(furnished_room(), elevation_deg=90, width_px=300)
     low, high = plan.pixels([[0, 0, 0], ROOM])
     assert low[0] < 10 < 290 < high[0] and high[1] < 10 and low[1] > plan.rgb.shape[0] - 10
@@ -20,7 +18,7 @@ def test_a_plan_has_x_to_the_right_and_y_up_and_knows_what_is_visible() -> None:
     assert plan.shows(under_cabinet_on_floor_outside).tolist() == [False, True, False]
 
 
-def test_near_walls_are_removed_unless_two_sided() -> None:
+def test_near_walls_are_removed_unless_two_sided():
     floor = np.array([[3.0, 0.5, 0.0]])  # behind the wall at y = 0, the nearest to the eye
     options = {"elevation_deg": 45.0, "width_px": 200}
     assert dollhouse(furnished_room(ceiling=False), **options).shows(floor).all()

@@ -1,10 +1,7 @@
 """Exact information: the kernel against its plain twin and against what is known by hand."""
 
-from __future__ import annotations
-
 import numpy as np
 
-from conftest import RandomViews
 from wheretolook.geometry.camera import ColmapCamera, PinholeCamera
 from wheretolook.geometry.pose_information import TRACE, bearing_numbers, information_matrices
 from wheretolook.geometry.poses import poses_looking_along, transform
@@ -12,7 +9,7 @@ from wheretolook.visibility.frustum import LandmarkSets, PosedViews
 from wheretolook_paper.fisher.exact import exact_information, exact_information_plain
 
 
-def test_information_is_that_of_the_plain_twin(random_views: RandomViews, device: str) -> None:
+def test_information_is_that_of_the_plain_twin(random_views, device):
     v = random_views
     arguments = PosedViews(v.camera, v.cam_from_world, v.points, v.visible, v.location_rows)
     plain = exact_information_plain(arguments)
@@ -20,7 +17,7 @@ def test_information_is_that_of_the_plain_twin(random_views: RandomViews, device
     assert np.sum(plain @ TRACE > 0) > 30
 
 
-def test_information_by_hand(device: str) -> None:
+def test_information_by_hand(device):
     camera = PinholeCamera(100, 100, 50.0)  # sees 45 degrees to every side
     points = np.array([[2, 0, 0], [2, 1.9, 0], [2, 2.1, 0], [-2, 0, 0], [np.nan, 0, 0], [0, 0, 0]])
     poses = poses_looking_along(np.zeros((3, 3)), [[1.0, 0, 0], [-1, 0, 0], [0, 0, 1]])
@@ -32,7 +29,7 @@ def test_information_by_hand(device: str) -> None:
     np.testing.assert_allclose(np.diag(information_matrices(found[1])), [0, 0.25, 0.25, 0, 1, 1], atol=1e-12)
 
 
-def test_a_distorted_camera_sums_up_what_it_sees(random_views: RandomViews) -> None:
+def test_a_distorted_camera_sums_up_what_it_sees(random_views):
     v = random_views
     camera = ColmapCamera("OPENCV", 640, 480, (300.0, 300.0, 330.0, 235.0, -0.2, 0.05, 1e-3, -1e-3))
     found = exact_information(PosedViews(camera, v.cam_from_world, v.points, v.visible, v.location_rows))

@@ -1,7 +1,5 @@
 """The field against direct sums over landmarks, and against the exact information that it approximates."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from pathlib import Path
@@ -14,7 +12,7 @@ from paper.fisher.twins import field_sums_plain
 from wheretolook.geometry.lattices import fibonacci_sphere
 from wheretolook.geometry.pose_information import bearing_numbers
 from wheretolook_paper.fisher.field import FisherField, stationary_axis_of_trace
-from wheretolook_paper.fisher.soft_visibility import GaussianProcessVisibility, QuadraticVisibility, SoftVisibility
+from wheretolook_paper.fisher.soft_visibility import GaussianProcessVisibility, QuadraticVisibility
 
 HALF_ANGLE = 0.766  # of the paper's camera
 VISIBILITIES = [QuadraticVisibility(HALF_ANGLE), GaussianProcessVisibility(HALF_ANGLE, 0.45)]
@@ -22,7 +20,7 @@ VISIBILITIES = [QuadraticVisibility(HALF_ANGLE), GaussianProcessVisibility(HALF_
 
 @pytest.mark.parametrize("visibility", VISIBILITIES)
 @pytest.mark.parametrize("masked", [False, True])
-def test_a_field_holds_the_sums_of_the_plain_twin(visibility: SoftVisibility, masked: bool, device: str) -> None:
+def test_a_field_holds_the_sums_of_the_plain_twin(visibility, masked, device):
     rng = np.random.default_rng(0)
     locations = rng.uniform(-2, 2, (20, 3))
     points = rng.uniform(-5, 5, (3000, 3))
@@ -42,18 +40,7 @@ def test_a_field_holds_the_sums_of_the_plain_twin(visibility: SoftVisibility, ma
     np.testing.assert_allclose(field.information(7, axes), expected, atol=1e-5 * np.abs(expected).max())
 
 
-@pytest.mark.parametrize("visibility", VISIBILITIES)
-def test_a_map_far_from_the_origin(visibility: SoftVisibility) -> None:
-    rng = np.random.default_rng(0)
-    far = np.array([4e6, -2e6, 512.0])
-    locations = rng.integers(-512, 512, (3, 3)) / 256
-    points = rng.integers(-2048, 2048, (200, 3)) / 256
-    near = FisherField.build(locations, points, visibility)
-    np.testing.assert_array_equal(FisherField.build(locations + far, points + far, visibility).factors, near.factors)
-    assert not FisherField.build(locations, np.empty((0, 3)), visibility).factors.any()
-
-
-def test_the_stationary_axis_has_no_gradient() -> None:
+def test_the_stationary_axis_has_no_gradient():
     rng = np.random.default_rng(0)
     visibility = QuadraticVisibility(HALF_ANGLE)
     points = rng.normal((1, 2, 0), size=(100, 3))
@@ -62,7 +49,7 @@ def test_the_stationary_axis_has_no_gradient() -> None:
     bearings = torch.from_numpy(points) / distance[:, None]
     k1, k2, k3 = visibility.coefficients
 
-    def trace(z: torch.Tensor) -> torch.Tensor:
+    def trace(z):
         cosine = bearings @ z
         return ((k1 * cosine**2 + k2 * cosine + k3) * (2 / distance**2 + 2)).sum()
 
@@ -73,6 +60,6 @@ def test_the_stationary_axis_has_no_gradient() -> None:
 
 
 @pytest.mark.slow
-def test_the_benchmark_runs_small() -> None:
-    options = ["--landmarks", "300", "--voxels", "2", "--directions", "20", "--repeats", "1", "--samples", "10"]
+def test_the_benchmark_runs_small():
+    options = ["--landmarks", "300", "--samples", "10"]
     subprocess.run([sys.executable, str(Path(__file__).with_name("bench_fisher.py")), *options], check=True)

@@ -1,19 +1,15 @@
 """Soft visibilities against published numbers and against scikit-learn's Gaussian process."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF
 
 from wheretolook.geometry.camera import ColmapCamera, PinholeCamera
-from wheretolook.geometry.poses import Float
 from wheretolook_paper.fisher.soft_visibility import (
     JITTER,
     GaussianProcessVisibility,
     QuadraticVisibility,
-    SoftVisibility,
     cone_half_angle,
 )
 
@@ -23,12 +19,12 @@ PUBLISHED_LENGTHS = {30: 0.646, 50: 0.481, 70: 0.452, 100: 0.389, 120: 0.365, 15
 """Of rpg_information_field, params/fov_approximator_gp/fov45_fs*_lm1000_k15/kernel_params.txt."""
 
 
-def random_directions(n: int, seed: int) -> Float:
+def random_directions(n, seed):
     vectors = np.random.default_rng(seed).normal(size=(n, 3))
     return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
 
 
-def values(visibility: SoftVisibility, axes: Float, bearings: Float) -> Float:
+def values(visibility, axes, bearings):
     """v of axes (D, 3) and bearings (N, 3); (D, N)."""
     return visibility.of_axes(axes) @ visibility.finish(visibility.of_bearings(bearings).T)
 
@@ -36,12 +32,12 @@ def values(visibility: SoftVisibility, axes: Float, bearings: Float) -> Float:
 @pytest.mark.parametrize(
     ("boundary", "coefficients"), [(0.5, (0.70710678, 0.5, -0.20710678)), (0.8, (0.10710678, 0.5, 0.39289322))]
 )
-def test_published_coefficients(boundary: float, coefficients: tuple[float, ...]) -> None:
+def test_published_coefficients(boundary, coefficients):
     found = QuadraticVisibility(QUARTER, boundary, boundary).coefficients
     np.testing.assert_allclose(found, coefficients, atol=1e-8)
 
 
-def test_scikit_learn_predicts_the_same() -> None:
+def test_scikit_learn_predicts_the_same():
     visibility = GaussianProcessVisibility(QUARTER, 0.45, n_factors=70)
     axes = random_directions(200, 0)
     bearings = random_directions(30, 1)
@@ -52,12 +48,12 @@ def test_scikit_learn_predicts_the_same() -> None:
 
 
 @pytest.mark.parametrize("n_factors", PUBLISHED_LENGTHS)
-def test_fitted_lengths_are_near_the_published_ones(n_factors: int) -> None:
+def test_fitted_lengths_are_near_the_published_ones(n_factors):
     found = GaussianProcessVisibility.fitted(QUARTER, n_factors).length
     assert found == pytest.approx(PUBLISHED_LENGTHS[n_factors], rel=0.01 if n_factors >= 50 else 0.06)
 
 
-def test_the_cone_has_the_solid_angle_of_the_field_of_view() -> None:
+def test_the_cone_has_the_solid_angle_of_the_field_of_view():
     cube_face = PinholeCamera(600, 600, 300.0)  # a sixth of the sphere
     assert 2 * np.pi * (1 - np.cos(cone_half_angle(cube_face))) == pytest.approx(4 * np.pi / 6)
     narrow = PinholeCamera(200, 100, 1e4)

@@ -1,19 +1,14 @@
 """Plain versions of the Fisher information kernels."""
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
 from wheretolook.geometry import pose_information
 from wheretolook.geometry.pose_information import N_NUMBERS, bearing_numbers
-from wheretolook.geometry.poses import Float
 from wheretolook.visibility.frustum import offsets_from
 from wheretolook_paper.fisher.field import NEAREST_M
-from wheretolook_paper.fisher.soft_visibility import SoftVisibility
 
 
-def information_matrices(numbers: ArrayLike, pivots: ArrayLike | None = None) -> Float:
+def information_matrices(numbers, pivots=None):
     """`pose_information.information_matrices` (..., 6, 6) of a pose that is rotated about pivots.
 
     These are offsets (..., 3) m from the camera centre; None for the centre itself.
@@ -26,9 +21,7 @@ def information_matrices(numbers: ArrayLike, pivots: ArrayLike | None = None) ->
     return np.asarray(np.swapaxes(turn, -1, -2) @ matrices @ turn)
 
 
-def field_sums_plain(
-    locations: Float, points: Float, visibility: SoftVisibility, unoccluded: NDArray[np.bool_] | None = None
-) -> Float:
+def field_sums_plain(locations, points, visibility, unoccluded=None):
     """What `field_sums` computes, in NumPy and double precision."""
     result = np.empty((len(locations), visibility.n_factors, N_NUMBERS))
     for row, location in enumerate(locations):
@@ -40,6 +33,6 @@ def field_sums_plain(
     return result
 
 
-def eigenvalues_plain(numbers: ArrayLike, pivots: ArrayLike | None = None) -> Float:
+def eigenvalues_plain(numbers, pivots=None):
     """What `eigenvalues` computes, in NumPy, ascending."""
     return np.asarray(np.linalg.eigvalsh(information_matrices(numbers, pivots)))

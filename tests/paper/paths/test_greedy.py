@@ -1,7 +1,5 @@
 """ActLoc's greedy rule, and evenly spaced waypoints."""
 
-from __future__ import annotations
-
 from itertools import product
 
 import numpy as np
@@ -11,7 +9,7 @@ from wheretolook.planning.view_sequence import TurnLimit, best_sequence
 from wheretolook_paper.paths.path_comparison import greedy_sequence, resample_path
 
 
-def test_greedy_rule_is_actlocs() -> None:
+def test_greedy_rule_is_actlocs():
     """Written out for rows of pitch and columns of yaw."""
     directions = direction_lattice(0, "yaw-pitch")
     limit = TurnLimit.of(directions, 30)
@@ -32,7 +30,7 @@ def test_greedy_rule_is_actlocs() -> None:
     assert best_sequence(scores, limit).scores.sum() > sequence.scores.sum()
 
 
-def test_waypoints_every_20_cm() -> None:
+def test_waypoints_every_20_cm():
     path = np.array([[0, 0, 0], [1, 0, 0], [1, 0, 0], [1, 0.5, 0]])
     along = [*np.arange(0, 1.5, 0.2), 1.5]
     np.testing.assert_allclose(resample_path(path), [(min(s, 1), max(0, s - 1), 0) for s in along], atol=1e-12)

@@ -1,17 +1,15 @@
 """Views of compared paths localized jointly: those of a stop, and the last views linked by odometry."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import numpy as np
 import pandas as pd
 import pytest
 
+from paper.matched_views import matched_views
 from planning.rooms import CAMERA, room_landmarks
 from wheretolook.dataset.viewpoint_table import pose_columns
-from wheretolook.geometry.poses import pose_error, poses_looking_along
-from wheretolook.localization.estimation import PoseEstimator
+from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.planning.config import StopConfig
 from wheretolook_paper.evaluation.looks import label_sets
 from wheretolook_paper.figures.paths import paths_figure
@@ -36,31 +34,14 @@ METHODS = ("forward", "set", "set greedy")  # the last by another rule, which ha
 CONFIG = PathsConfig(methods=("forward", "set"), stops=StopConfig(2, 0.7), last_views=3, resamples=50)
 
 
-def seen(cam_from_world: np.ndarray, blind: np.ndarray, seed: int = 0) -> pd.DataFrame:
-    """What views (B, 3, 4) match, nothing right where they are blind, and what comes of localizing each alone."""
-    rng = np.random.default_rng(seed)
-    estimator = PoseEstimator(LANDMARKS.points)
-    rows = []
-    for pose, wrong in zip(cam_from_world, blind, strict=True):
-        there = LANDMARKS.points @ pose[:, :3].T + pose[:, 3]
-        at = CAMERA.project(there)
-        visible = np.flatnonzero((there[:, 2] > 0.1) & CAMERA.in_image(at))
-        visible = np.sort(rng.choice(visible, min(40, len(visible)), replace=False))
-        pixels = rng.uniform((0, 0), (160, 120), (len(visible), 2)) if wrong else at[visible]
-        pixels = (pixels + rng.normal(0, 0.2, pixels.shape)).astype(np.float32)
-        found = estimator.estimate(pixels, visible, CAMERA)
-        inliers = 0 if found is None else int(found[1].sum())
-        error_m, error_deg = (np.nan, np.nan) if found is None else pose_error(found[0], pose)
-        status = "localized" if inliers >= 10 else "no_pose"
-        matched = {"matched_rows": visible.astype(np.int32), "matched_pixels": pixels.ravel(), "location_id": len(rows)}
-        rows.append(
-            {"status": status, "error_m": float(error_m), "error_deg": float(error_deg), "n_inliers": inliers} | matched
-        )
-    return pd.DataFrame(rows).assign(**pose_columns(cam_from_world))
+def seen(cam_from_world, blind, seed=0):
+    """Return the labels of views (B, 3, 4), which match nothing right where they are blind."""
+    labels = matched_views(LANDMARKS.points, CAMERA, cam_from_world, blind, seed)
+    return labels.assign(location_id=range(len(labels)))
 
 
 @pytest.fixture(scope="module")
-def compared() -> tuple[ComparedPaths, pd.DataFrame, pd.DataFrame, pd.DataFrame]:
+def compared():
     """The same way by two methods, with a stop at the blind place of one; paths, further looks, and labels of both."""
     pose = poses_looking_along(POSITIONS, AXES)
     labels = pd.concat([seen(pose, np.arange(6) == BLIND, seed) for seed in (0, 1)], ignore_index=True)
@@ -77,7 +58,7 @@ def compared() -> tuple[ComparedPaths, pd.DataFrame, pd.DataFrame, pd.DataFrame]
     return ComparedPaths(paths, views), further, labels, seen(aside, np.array([False]))
 
 
-def test_joint_views_localize_where_a_single_view_does_not(compared: tuple) -> None:
+def test_joint_views_localize_where_a_single_view_does_not(compared):
     single, further, labels, further_labels = compared
     near = (single.views["status"] == "localized") & (single.views["error_m"] < 0.25)
     assert near.tolist() == [number % 6 != BLIND for number in range(18)]
@@ -104,7 +85,7 @@ def test_joint_views_localize_where_a_single_view_does_not(compared: tuple) -> N
     assert paths_figure(table.reset_index()).axes
 
 
-def test_odometry_without_noise_is_the_way_itself() -> None:
+def test_odometry_without_noise_is_the_way_itself():
     rng = np.random.default_rng(0)
     way = poses_looking_along(rng.uniform(-2, 2, (6, 3)), rng.normal(size=(6, 3)))
     steps = noisy_steps(way, 0.0, 0.0, rng)

@@ -1,22 +1,18 @@
 """A tiny release with every kind of results, made up but for its tables of viewpoints."""
 
-from __future__ import annotations
-
 import json
-from pathlib import Path
 
 import pandas as pd
 
 from synthetic_dataset import make_dataset
 from synthetic_scores import make_scores
 from wheretolook.dataset.config import RELEASE_FILE
-from wheretolook.dataset.layout import Dataset
 from wheretolook_paper.evaluation.paper_tables import write_paper_tables
 
-METHODS: tuple[str, ...] = ("random", "bins", "fisher-trace-exact", "mlp-2d+z", "mlp-2d+3d")
+METHODS = ("random", "bins", "fisher-trace-exact", "mlp-2d+z", "mlp-2d+3d")
 
 
-def make_release(root: Path) -> Dataset:
+def make_release(root):
     """A dataset of two test scenes with results, the record of one network, and no MLflow store."""
     dataset = make_dataset(root, ("test", "test"), n_locations=4, n_directions=6)
     results = root / "results"
@@ -44,26 +40,26 @@ def make_release(root: Path) -> Dataset:
     return dataset
 
 
-def history() -> pd.DataFrame:
+def history():
     """Three epochs; the second is the best."""
     columns = {"epoch": [0, 1, 2], "train_bce": [0.6, 0.5, 0.4], "val_bce": [0.7, 0.6, 0.65]}
     precision = {"train_average_precision": [0.5, 0.7, 0.9], "val_average_precision": [0.5, 0.75, 0.7]}
     return pd.DataFrame({**columns, **precision})
 
 
-def calibration() -> pd.DataFrame:
+def calibration():
     bins = {"bin_low": [0.0, 0.5], "bin_high": [0.5, 1.0], "mean_predicted": [0.2, 0.8], "share_good": [0.1, 0.9]}
     about = {"method": "mlp-2d+z", "temperature": 1.2, "n_val": 10, "n_views": 30, "when": "before"}
     return pd.DataFrame({**bins, "n": [10, 20], "ece": 0.1, "nll": 0.3}).assign(**about)
 
 
-def looks() -> pd.DataFrame:
+def looks():
     rows = [("together", 1, 0.7, 0.7), ("together", 2, 0.8, 0.75), ("random", 2, 0.5, None)]
     table = pd.DataFrame(rows, columns=["strategy", "n_looks", "good", "any_good"]).assign(n_locations=8)
     return pd.concat([table.assign(split=split) for split in ("val", "test")])
 
 
-def runtimes() -> pd.DataFrame:
+def runtimes():
     about = {
         "locations": 648,
         "directions": 500,
@@ -87,7 +83,7 @@ def runtimes() -> pd.DataFrame:
     return pd.DataFrame(rows).assign(**about)
 
 
-def learners() -> pd.DataFrame:
+def learners():
     rows = [
         {"learner": learner, "trained_on": source, "seed": seed, "split": split, "scene": scene,
          "average_precision": 0.8 + seed / 10, "roc_auc": 0.9, "ece": 0.1, "regret": regret}
@@ -97,7 +93,7 @@ def learners() -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def paths() -> pd.DataFrame:
+def paths():
     columns = ("pairs", "failures", "views", "localized", "localized_low", "localized_high", "times_forward",
                "times_forward_low", "times_forward_high", "times_forward_length", "length_m", "turn_deg_per_m",
                "promised")  # fmt: skip

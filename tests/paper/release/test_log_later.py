@@ -1,7 +1,5 @@
 """Results of stages whose logging fails: they are kept, a warning says so, and the stage run again logs them."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 
@@ -13,7 +11,6 @@ from tests.synthetic_dataset import make_dataset
 from wheretolook.commands.evaluate import evaluate_methods, not_logged
 from wheretolook.commands.label import log_labels
 from wheretolook.commands.train import train_methods
-from wheretolook.dataset.layout import Dataset
 from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.tracking.runs import artifact, finished_runs
 from wheretolook.tracking.store import TrackingConfig, client
@@ -28,16 +25,16 @@ SMALL = train_config("mlp-2d", epochs=3, hidden=(8,), accelerator="cpu")
 
 
 @pytest.fixture
-def dataset(tmp_path: Path) -> Dataset:
+def dataset(tmp_path):
     return make_dataset(tmp_path / "tiny", ("train", "val", "test"), n_locations=6, n_directions=8)
 
 
 @pytest.fixture
-def tracking(tmp_path: Path) -> TrackingConfig:
+def tracking(tmp_path):
     return TrackingConfig(str(tmp_path / "mlruns"))
 
 
-def break_store(tracking: TrackingConfig) -> None:
+def break_store(tracking):
     """Nothing can be stored with runs from now on."""
     folder = Path(tracking.artifacts)
     if folder.is_dir():
@@ -45,15 +42,13 @@ def break_store(tracking: TrackingConfig) -> None:
     folder.write_text("no folder")
 
 
-def mend_store(tracking: TrackingConfig) -> None:
+def mend_store(tracking):
     folder = Path(tracking.artifacts)
     folder.unlink()
     folder.with_name("kept").rename(folder)
 
 
-def test_a_training_that_cannot_be_logged_is_kept_and_logged_later(
-    dataset: Dataset, tracking: TrackingConfig, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_training_that_cannot_be_logged_is_kept_and_logged_later(dataset, tracking, monkeypatch):
     end = EpochRecord.on_train_end
     with monkeypatch.context() as patch:
         patch.setattr(EpochRecord, "on_train_end", lambda *given: (break_store(tracking), end(*given))[1])
@@ -75,9 +70,7 @@ def test_a_training_that_cannot_be_logged_is_kept_and_logged_later(
     assert [metric.value for metric in logged] == pytest.approx(list(table["val_bce"]), rel=1e-12)
 
 
-def test_an_evaluation_that_cannot_be_logged_is_kept_and_logged_later(
-    dataset: Dataset, tracking: TrackingConfig, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_evaluation_that_cannot_be_logged_is_kept_and_logged_later(dataset, tracking, monkeypatch):
     from wheretolook.evaluation import run
 
     config = EvaluateConfig(("random", "visible"), resamples=50, top_n=(1,))
@@ -95,9 +88,7 @@ def test_an_evaluation_that_cannot_be_logged_is_kept_and_logged_later(
     assert not not_logged(dataset).exists()
 
 
-def test_labels_that_cannot_be_logged_are_summarized_and_logged_later(
-    dataset: Dataset, tracking: TrackingConfig
-) -> None:
+def test_labels_that_cannot_be_logged_are_summarized_and_logged_later(dataset, tracking):
     tracking.root.mkdir()
     (tracking.root / "kept").mkdir()
     (tracking.root / "artifacts").write_text("")

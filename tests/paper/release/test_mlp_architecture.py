@@ -1,7 +1,5 @@
 """The table of layers and the values in them are those of the network."""
 
-from __future__ import annotations
-
 import torch
 
 from wheretolook.inputs.channels import PAPER_VARIANTS
@@ -10,14 +8,14 @@ from wheretolook.scorers.mlp.network import NetworkSpec, ViewpointNetwork
 from wheretolook_paper.release.mlp_architecture import architecture_table
 
 
-def make_network(variant: str, **options) -> ViewpointNetwork:  # type: ignore[no-untyped-def]
+def make_network(variant, **options):
     torch.manual_seed(0)
     channels = PAPER_VARIANTS[variant]
     statistics = FeatureStatistics(channels, (1.0,) * len(channels), (2.0,) * len(channels))
     return ViewpointNetwork(NetworkSpec(statistics, **options)).eval()
 
 
-def test_the_papers_networks_have_their_sizes() -> None:
+def test_the_papers_networks_have_their_sizes():
     for variant, size in (("2d", 1800), ("2d+z", 2700), ("2d+3d", 4500)):
         network = make_network(variant)
         table = architecture_table(network)

@@ -1,10 +1,7 @@
 """A release logged as MLflow runs: once, as the stages log, and open to every search that the page on runs names."""
 
-from __future__ import annotations
-
 import dataclasses
 import shutil
-from pathlib import Path
 
 import pandas as pd
 import pytest
@@ -17,12 +14,12 @@ from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.evaluation.results import latest_scores, read_scores
 from wheretolook.tracking.runs import experiment_ids, finished_runs, newest_run
 from wheretolook.tracking.store import TrackingConfig, client
-from wheretolook_paper.release.runs import ReleaseRuns, log_release
+from wheretolook_paper.release.runs import log_release
 from wheretolook_paper.release.training_histories import histories, keep_histories, trained
 
 
 @pytest.fixture(scope="module")
-def logged(tmp_path_factory: pytest.TempPathFactory) -> tuple[Dataset, TrackingConfig, ReleaseRuns]:
+def logged(tmp_path_factory):
     folder = tmp_path_factory.mktemp("logged")
     release = make_release(folder / "data" / "release")
     tracking = TrackingConfig(str(folder / "mlruns"))
@@ -30,14 +27,14 @@ def logged(tmp_path_factory: pytest.TempPathFactory) -> tuple[Dataset, TrackingC
 
 
 @pytest.fixture
-def store(logged: tuple[Dataset, TrackingConfig, ReleaseRuns], tmp_path: Path) -> tuple[Dataset, TrackingConfig]:
+def store(logged, tmp_path):
     """A release and its store that may be changed."""
     shutil.copytree(logged[0].root.parent.parent, tmp_path / "copy")
     release = Dataset.load(tmp_path / "copy" / "data" / "release")
     return release, TrackingConfig(str(tmp_path / "copy" / "mlruns"))
 
 
-def children(tracking: TrackingConfig, parent: str) -> dict[str, tuple[dict[str, str], dict[str, float]]]:
+def children(tracking, parent):
     """Parameters and metrics of the runs nested in a run, by their names."""
     experiment = client(tracking).get_run(parent).info.experiment_id
     query = f"tags.mlflow.parentRunId = '{parent}'"
@@ -46,7 +43,7 @@ def children(tracking: TrackingConfig, parent: str) -> dict[str, tuple[dict[str,
     return {run.info.run_name: (run.data.params, run.data.metrics) for run in runs}
 
 
-def test_every_kind_of_result_becomes_a_run_once(logged: tuple[Dataset, TrackingConfig, ReleaseRuns]) -> None:
+def test_every_kind_of_result_becomes_a_run_once(logged):
     release, tracking, runs = logged
     names = {"evaluate", "learners", "paths", "looks", "benchmark", "evaluate interiors", "train mlp-2d+3d"}
     assert runs.ids.keys() == names and len({*runs.ids.values()}) == runs.new == 7
@@ -69,7 +66,7 @@ def test_every_kind_of_result_becomes_a_run_once(logged: tuple[Dataset, Tracking
     assert looks["together, 2 looks (looks release)"][1] == {"good": 0.8, "any_good": 0.75}
 
 
-def test_a_release_is_logged_as_its_evaluation_was(tmp_path: Path) -> None:
+def test_a_release_is_logged_as_its_evaluation_was(tmp_path):
     """The same names, parameters and metrics; and in the store of the evaluation itself its run is found."""
     dataset = make_dataset(tmp_path / "tiny", ("test", "test"), n_locations=4, n_directions=6)
     (dataset.root / "weights").mkdir()
@@ -91,7 +88,7 @@ def test_a_release_is_logged_as_its_evaluation_was(tmp_path: Path) -> None:
     assert logged == client(own).get_run(evaluated.info.run_id).data.metrics
 
 
-def test_histories_travel_with_a_release(store: tuple[Dataset, TrackingConfig]) -> None:
+def test_histories_travel_with_a_release(store):
     release, tracking = store
     assert histories(tracking, "release") == {}
     history().assign(method="mlp-2d+3d").to_csv(release.root / "results" / "training.csv", index=False)
@@ -109,13 +106,13 @@ def test_histories_travel_with_a_release(store: tuple[Dataset, TrackingConfig]) 
     assert (release.root / "results" / "training.csv").is_file()
 
 
-def test_an_interrupted_run_is_logged_again(store: tuple[Dataset, TrackingConfig]) -> None:
+def test_an_interrupted_run_is_logged_again(store):
     release, tracking = store
     run = newest_run(tracking, "paths")
     assert run is not None
     mlflow = client(tracking)
 
-    def names() -> list[str]:
+    def names():
         found = mlflow.search_runs(experiment_ids(mlflow, tracking), "tags.stage = 'paths'", max_results=10_000)
         return sorted(one.info.run_name for one in found)
 

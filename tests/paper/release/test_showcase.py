@@ -1,7 +1,5 @@
 """A scene of a release is generated again from its seed, and the data of figures are those of the scene."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from dataclasses import asdict
@@ -18,7 +16,7 @@ from wheretolook.dataset.viewpoint_files import write_table
 from wheretolook.dataset.viewpoint_table import LOCALIZED, NO_POSE, poses
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.lattices import VoxelGrid
-from wheretolook.geometry.poses import Float, camera_centers, poses_looking_along
+from wheretolook.geometry.poses import camera_centers, poses_looking_along
 from wheretolook.inputs.statistics import FeatureStatistics
 from wheretolook.mapping.colmap_model import save_mapping_poses
 from wheretolook.rendering.raycasting import MeshRaycaster
@@ -32,7 +30,7 @@ from wheretolook.utils.errors import ConfigError, SceneError
 from wheretolook.visibility.config import OcclusionConfig
 from wheretolook.visibility.occlusion import MeshOcclusion
 from wheretolook_paper.figures.overview import outcome_in_words
-from wheretolook_paper.release.showcase import Showcase, learning_of, open_showcase, peaks_of, pipeline_of
+from wheretolook_paper.release.showcase import learning_of, open_showcase, peaks_of, pipeline_of
 from wheretolook_rooms.generator import generate_apartment
 
 CAMERA = PinholeCamera(96, 72, 48.0)
@@ -43,7 +41,7 @@ SAMPLING = SampleConfig(grid=(5, 4, 3), directions=40, keep=0, max_directions=12
 
 
 @pytest.fixture(scope="module")
-def release(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+def release(tmp_path_factory):
     """A release of one apartment whose landmarks are random points of its mesh; views up localize worse."""
     root = tmp_path_factory.mktemp("data") / "tiny"
     scene = SceneFolder(root / f"apartment-{SEED:03d}", "test", CAMERA)
@@ -80,7 +78,7 @@ def release(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
 
 
 @pytest.fixture(scope="module")
-def showcase(release: Dataset) -> Showcase:
+def showcase(release):
     return open_showcase(release)
 
 
@@ -89,11 +87,11 @@ class UpScorer(Scorer):
 
     name = "up"
 
-    def score(self, cam_from_world: Float) -> Float:
+    def score(self, cam_from_world):
         return 0.5 - 0.4 * cam_from_world[:, 2, 2] + 0.05 * cam_from_world[:, 2, 0]
 
 
-def test_the_scene_is_the_one_that_was_sampled(showcase: Showcase) -> None:
+def test_the_scene_is_the_one_that_was_sampled(showcase):
     assert showcase.name == "apartment-003" and showcase.keep == 100
     assert len(showcase.directions) == SAMPLING.directions
     assert set(showcase.table["location_id"]) <= set(showcase.free)
@@ -102,7 +100,7 @@ def test_the_scene_is_the_one_that_was_sampled(showcase: Showcase) -> None:
     assert "400 landmarks" in showcase.summary() and "12 images" in showcase.summary()
 
 
-def test_another_scene_than_the_one_that_was_labelled_is_refused(release: Dataset, tmp_path: Path) -> None:
+def test_another_scene_than_the_one_that_was_labelled_is_refused(release, tmp_path):
     copy = Path(shutil.copytree(release.root, tmp_path / "tiny"))
     about = json.loads((copy / "release.json").read_text())
     about["settings"]["scenes"]["apartment"]["area_m2"] = 40
@@ -113,7 +111,7 @@ def test_another_scene_than_the_one_that_was_labelled_is_refused(release: Datase
         open_showcase(release, "apartment-004")
 
 
-def test_pipeline_takes_the_best_views(showcase: Showcase) -> None:
+def test_pipeline_takes_the_best_views(showcase):
     scorer = UpScorer(showcase.localization_map)
     location = showcase.instructive_location()
     pipeline = pipeline_of(showcase, scorer, location)
@@ -128,7 +126,7 @@ def test_pipeline_takes_the_best_views(showcase: Showcase) -> None:
     assert pipeline.rgb.shape == (72, 96, 3) and pipeline.rgb.std() > 1
 
 
-def test_peaks_are_labelled_views_with_what_came_of_them(showcase: Showcase) -> None:
+def test_peaks_are_labelled_views_with_what_came_of_them(showcase):
     scorer = UpScorer(showcase.localization_map)
     location = showcase.instructive_location()
     found = peaks_of(showcase, scorer, location, n=2)
@@ -143,7 +141,7 @@ def test_peaks_are_labelled_views_with_what_came_of_them(showcase: Showcase) -> 
     np.testing.assert_array_equal(found.tried[1], (rows["error_m"] < 0.05).to_numpy())
 
 
-def test_learning_follows_the_best_and_the_worst_view(showcase: Showcase) -> None:
+def test_learning_follows_the_best_and_the_worst_view(showcase):
     statistics = FeatureStatistics(("u", "v"), (48.0, 36.0), (20.0, 20.0))
     network = TrainedNetwork("mlp-2d", ViewpointNetwork(NetworkSpec(statistics, bins=6)), CAMERA)
     scorer = BinnedNetworkScorer(showcase.localization_map, network)
@@ -157,5 +155,5 @@ def test_learning_follows_the_best_and_the_worst_view(showcase: Showcase) -> Non
         assert learning.outcome == outcome_in_words(rows.iloc[int(np.argmin(np.abs(scores - score)))], brief=True)
 
 
-def _poses_at(showcase: Showcase, location: int) -> Float:
+def _poses_at(showcase, location):
     return poses_looking_along(np.tile(showcase.center(location), (len(showcase.directions), 1)), showcase.directions)

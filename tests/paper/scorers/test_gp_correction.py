@@ -1,7 +1,5 @@
 """Adaptation of log-odds to a scene by a Gaussian process, against scikit-learn's."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.special import expit
 from sklearn.gaussian_process import GaussianProcessClassifier
@@ -23,7 +21,7 @@ def random_views(n_locations=30, n_directions=12, seed=0, shift=0.0):
     return LocalizedViews.rendered(log_odds, good, centers, axes, np.repeat(np.arange(n_locations), n_directions))
 
 
-def test_the_correction_is_scikit_learns_gaussian_process() -> None:
+def test_the_correction_is_scikit_learns_gaussian_process():
     views = random_views()
     flat = LocalizedViews.rendered(np.zeros(len(views)), views.good, views.centers, views.axes, views.group)
     # without log-odds, offset and correction are one process, of both kernels; its reach covers the room
@@ -35,7 +33,7 @@ def test_the_correction_is_scikit_learns_gaussian_process() -> None:
     np.testing.assert_allclose(ours.log_odds(flat), latent, atol=5e-3)
 
 
-def test_adapting_corrects_the_scorer_where_it_is_wrong() -> None:
+def test_adapting_corrects_the_scorer_where_it_is_wrong():
     views = random_views(60)
     other = random_views(60, seed=1)
     fitted = adapt(views)
@@ -46,14 +44,14 @@ def test_adapting_corrects_the_scorer_where_it_is_wrong() -> None:
     assert abs(log_losses(fitted.held_out, views.good).mean() - after) < 0.1  # held-out loss is that of new views
 
 
-def test_noise_is_not_fitted() -> None:
+def test_noise_is_not_fitted():
     views = random_views(60)
     good = np.random.default_rng(3).random(len(views)) < expit(views.log_odds)
     honest = LocalizedViews.rendered(views.log_odds, good, views.centers, views.axes, views.group)
     assert log_losses(adapt(honest).held_out, good).mean() < log_losses(views.log_odds, good).mean() + 0.01
 
 
-def test_corrections_are_the_plain_sum() -> None:
+def test_corrections_are_the_plain_sum():
     views = random_views(20)
     weights = np.random.default_rng(0).normal(size=len(views))
     correction = Correction(views.centers, views.axes, weights, 0.7, 4.0)

@@ -1,14 +1,12 @@
 """The benchmark's most visible landmarks."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
 from synthetic_dataset import make_landmarks
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.lattices import axes_of_angles, fibonacci_sphere, yaw_pitch_angles
-from wheretolook.geometry.poses import Float, poses_looking_along
+from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.map import Map
 from wheretolook_paper.scorers.max_visibility import MaxVisibilityScorer, SwappedMaxVisibilityScorer
@@ -17,11 +15,11 @@ CAMERA = PinholeCamera(320, 320, 277.0)
 
 
 @pytest.fixture
-def localization_map() -> LocalizationMap:
+def localization_map():
     return LocalizationMap(Map(make_landmarks(np.random.default_rng(0), 400)), CAMERA)
 
 
-def count_of_the_benchmark(pose: Float, points: Float) -> int:
+def count_of_the_benchmark(pose, points):
     """Points at a depth of 0 to 3 m that are projected into the image, whatever stands before them."""
     count = 0
     for x, y, z in points @ pose[:, :3].T + pose[:, 3]:
@@ -32,7 +30,7 @@ def count_of_the_benchmark(pose: Float, points: Float) -> int:
     return count
 
 
-def test_max_visibility_counts_as_the_benchmark(localization_map: LocalizationMap, device: str) -> None:
+def test_max_visibility_counts_as_the_benchmark(localization_map, device):
     rng = np.random.default_rng(1)
     points = localization_map.landmarks.points
     poses = poses_looking_along(rng.uniform((-2, -2, 0.5), (2, 2, 2), (60, 3)), rng.normal(size=(60, 3)))
@@ -44,7 +42,7 @@ def test_max_visibility_counts_as_the_benchmark(localization_map: LocalizationMa
     assert sum(behind_3_m) > 100
 
 
-def test_the_swapped_one_looks_at_yaw_for_pitch_and_pitch_for_yaw(localization_map: LocalizationMap) -> None:
+def test_the_swapped_one_looks_at_yaw_for_pitch_and_pitch_for_yaw(localization_map):
     angles = yaw_pitch_angles()
     points = localization_map.landmarks.points
     scorer = SwappedMaxVisibilityScorer(localization_map)

@@ -1,7 +1,5 @@
 """The network of the whole sphere: its lattice, its tokens, its batches, what it learns, and its weights on disk."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -24,23 +22,23 @@ FEW = SphereConfig(points=48, cameras=8, width=32, heads=2, layers=1, dropout=0.
 
 
 @pytest.fixture
-def localization_map() -> LocalizationMap:
+def localization_map():
     landmarks = make_landmarks(np.random.default_rng(0), 200)
     return LocalizationMap(Map(landmarks, mapping_poses=make_mapping_poses(0)), CAMERA)
 
 
 @pytest.fixture
-def model() -> TrainedNetwork[SphereNetwork]:
+def model():
     """Untrained; its logits differ from direction to direction and from place to place."""
     torch.manual_seed(0)
     return TrainedNetwork("sphere", SphereNetwork(FEW).requires_grad_(False), CAMERA, 1.5, -0.25)
 
 
-def at_angles(*yaw_pitch_deg: tuple[float, float]) -> torch.Tensor:
+def at_angles(*yaw_pitch_deg):
     return torch.from_numpy(axes_of_angles(yaw_pitch_deg))
 
 
-def test_the_lattice_has_its_own_values_at_its_directions_and_means_between() -> None:
+def test_the_lattice_has_its_own_values_at_its_directions_and_means_between():
     values = torch.randn(2, PITCHES, YAWS, dtype=torch.float64)
     axes = torch.from_numpy(axes_of_angles(yaw_pitch_angles()))
     for lattice in (0, 1):
@@ -54,7 +52,7 @@ def test_the_lattice_has_its_own_values_at_its_directions_and_means_between() ->
     torch.testing.assert_close(found[0], 0.75 * values[0, 3, 10] + 0.25 * values[0, 3, 11])
 
 
-def test_a_pose_has_its_own_score(localization_map: LocalizationMap, model: TrainedNetwork[SphereNetwork]) -> None:
+def test_a_pose_has_its_own_score(localization_map, model):
     rng = np.random.default_rng(2)
     locations = rng.uniform((-1, -1, 1), (1, 1, 2), (5, 3))
     mask = rng.random((5, 200)) < 0.5

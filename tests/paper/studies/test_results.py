@@ -1,7 +1,5 @@
 """The commands that make the results: each is real, and is repeated when what it reads has changed."""
 
-from __future__ import annotations
-
 import argparse
 import importlib
 import json
@@ -22,7 +20,7 @@ ROOT = Path(__file__).parents[3]
 
 
 @pytest.mark.parametrize("name", list(steps()))
-def test_commands_have_real_options(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_commands_have_real_options(name, monkeypatch):
     monkeypatch.chdir(ROOT)
     for program, *options in steps(Path("scans"), Path("photographs"), "cpu")[name].commands:
         if program == "wheretolook":
@@ -35,14 +33,14 @@ def test_commands_have_real_options(name: str, monkeypatch: pytest.MonkeyPatch) 
             auto_parser(main, as_positional=False).parse_args(options)
 
 
-def check_script(program: str, options: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+def check_script(program, options, monkeypatch):
     """Parse the options of a script of benchmarks, or find the notebooks' script."""
     if program == "notebooks/execute.py":
         assert Path(program).is_file() and not options
         return
     parse = argparse.ArgumentParser.parse_args
 
-    def stop(parser: argparse.ArgumentParser) -> None:
+    def stop(parser):
         parse(parser, options)
         raise InterruptedError
 
@@ -53,7 +51,7 @@ def check_script(program: str, options: list[str], monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(argparse.ArgumentParser, "parse_args", parse)
 
 
-def test_a_step_is_repeated_when_weights_or_a_table_change() -> None:
+def test_a_step_is_repeated_when_weights_or_a_table_change():
     SET.parent.mkdir(parents=True)
     RESULTS.mkdir()
     SET.write_bytes(b"weights")
@@ -68,7 +66,7 @@ def test_a_step_is_repeated_when_weights_or_a_table_change() -> None:
     assert {"interiors", "film", "paths-aws_house", "release"} < {*outdated()}
 
 
-def test_scenes_are_combined_to_all() -> None:
+def test_scenes_are_combined_to_all():
     table = pd.read_csv(ROOT / RESULTS / "paths.csv")
     pooled = pooled_paths(table[table["scene"] != "all"])
     stored = table[table["scene"] == "all"].reset_index(drop=True)

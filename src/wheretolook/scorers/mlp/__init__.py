@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 from wheretolook.inputs.channels import ALL_CHANNELS, PAPER_VARIANTS, Layout
 from wheretolook.scorers.registry import Learner, Method, imported, network_scorer
-from wheretolook.training.config import FittingConfig, Keep, Schedule, check_choice, check_range
-from wheretolook.utils.errors import ConfigError, no_option
+from wheretolook.training.config import FittingConfig, Keep, Schedule
+from wheretolook.utils.errors import ConfigError, check_choice, check_range, check_share, no_option
 
 if TYPE_CHECKING:
     from wheretolook.training.learner import TrainingJob, TrainingResult
@@ -78,12 +78,14 @@ class MlpConfig(FittingConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_choice(self, "schedule", "constant", "cosine")
-        check_choice(self, "layout", "in_place", "compact")
-        check_choice(self, "keep", "best", "last")
-        check_range(self, "bins", at_least=1)
-        check_range(self, "noise_px", "noise_m", at_least=0)
-        check_range(self, "dropout", "input_dropout", at_least=0, below=1)
+        check_choice("schedule", self.schedule, ("constant", "cosine"))
+        check_choice("layout", self.layout, ("in_place", "compact"))
+        check_choice("keep", self.keep, ("best", "last"))
+        check_range("bins", self.bins, 1)
+        check_range("noise_px", self.noise_px, 0)
+        check_range("noise_m", self.noise_m, 0)
+        check_share("dropout", self.dropout)
+        check_share("input_dropout", self.input_dropout)
         if min(self.hidden, default=1) < 1:
             raise ConfigError("hidden layers must be at least one unit wide", value=self.hidden)
         if self.patience is not None and self.patience < 1:

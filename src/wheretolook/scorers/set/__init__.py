@@ -7,13 +7,13 @@ from math import inf
 
 from wheretolook.inputs.channels import ATTRIBUTES, OF_SIZE
 from wheretolook.scorers.registry import Learner, Method, imported, network_scorer
-from wheretolook.training.config import FittingConfig, check_range
-from wheretolook.utils.errors import ConfigError, no_option
+from wheretolook.training.config import FittingConfig
+from wheretolook.utils.errors import ConfigError, check_range, check_share, no_option
 
 
 @dataclass(frozen=True)
-class LandmarksConfig(FittingConfig):
-    """Options of a network over single landmarks.
+class MatchabilityConfig(FittingConfig):
+    """Options of a network over single landmarks: the probability that a visible landmark is detected.
 
     Args:
         landmarks: maximum number of landmarks of a view in a training step, chosen at random.
@@ -23,6 +23,8 @@ class LandmarksConfig(FittingConfig):
         enlarged: maximum factor by which scenes are scaled up or down in training; 1 does not scale them.
     """
 
+    epochs: int = no_option(6)
+    batch_size: int = no_option(256)
     landmarks: int = no_option(64)
     width: int = no_option(48)
     hidden: tuple[str, ...] = no_option(OF_SIZE)
@@ -30,7 +32,8 @@ class LandmarksConfig(FittingConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_range(self, "landmarks", "width", at_least=1)
+        check_range("landmarks", self.landmarks, 1)
+        check_range("width", self.width, 1)
         if not 1 <= self.enlarged < inf:
             raise ConfigError("scenes can be enlarged by a factor of 1 or more", value=self.enlarged)
         if unknown := [name for name in self.hidden if name not in ATTRIBUTES]:
@@ -39,15 +42,7 @@ class LandmarksConfig(FittingConfig):
 
 
 @dataclass(frozen=True)
-class MatchabilityConfig(LandmarksConfig):
-    """Options of the probability that a visible landmark is detected."""
-
-    epochs: int = no_option(6)
-    batch_size: int = no_option(256)
-
-
-@dataclass(frozen=True)
-class SetConfig(LandmarksConfig):
+class SetConfig(MatchabilityConfig):
     """Options of the network over the set of visible landmarks.
 
     With few training views, batches get smaller and epochs more (`wheretolook.scorers.set.learn.of_size`).
@@ -70,9 +65,9 @@ class SetConfig(LandmarksConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_range(self, "head", at_least=1)
-        check_range(self, "landmark_loss", at_least=0)
-        check_range(self, "dropout", at_least=0, below=1)
+        check_range("head", self.head, 1)
+        check_range("landmark_loss", self.landmark_loss, 0)
+        check_share("dropout", self.dropout)
 
     @property
     def starts_from(self) -> str:

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from wheretolook.scorers.registry import Learner, Method, imported, network_scorer
-from wheretolook.training.config import FittingConfig, check_range
-from wheretolook.utils.errors import ConfigError, no_option
+from wheretolook.training.config import FittingConfig
+from wheretolook.utils.errors import ConfigError, check_range, check_share, no_option
 
 
 @dataclass(frozen=True)
@@ -27,8 +27,8 @@ class ConvConfig(FittingConfig):
         super().__post_init__()
         if not self.widths or min(self.widths) < 1:
             raise ConfigError("there must be a convolution, and each at least one channel wide", value=self.widths)
-        check_range(self, "bins", at_least=1)
-        check_range(self, "dropout", at_least=0, below=1)
+        check_range("bins", self.bins, 1)
+        check_share("dropout", self.dropout)
 
 
 METHODS = (

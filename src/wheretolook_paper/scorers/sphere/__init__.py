@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from wheretolook.scorers.registry import Learner, Method, imported, network_scorer
-from wheretolook.training.config import FittingConfig, check_range
-from wheretolook.utils.errors import ConfigError, no_option
+from wheretolook.training.config import FittingConfig
+from wheretolook.utils.errors import ConfigError, check_range, check_share, no_option
 
 
 @dataclass(frozen=True)
@@ -34,8 +34,9 @@ class SphereConfig(FittingConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_range(self, "points", "cameras", "width", "heads", "layers", at_least=1)
-        check_range(self, "dropout", at_least=0, below=1)
+        for name in ("points", "cameras", "width", "heads", "layers"):
+            check_range(name, getattr(self, name), 1)
+        check_share("dropout", self.dropout)
         if self.width % self.heads:
             raise ConfigError("sphere needs a width that is a multiple of heads", value=(self.width, self.heads))
 

@@ -11,8 +11,8 @@ from selection.room import WEIGHTS
 from synthetic_dataset import make_landmarks
 from twins.open3d_renderer import Open3DRenderer
 from twins.visibility import count_plain
+from wheretolook.dataset.config import SampleConfig
 from wheretolook.dataset.sampling import sample_viewpoints
-from wheretolook.dataset.sampling_config import SampleConfig
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.lattices import VoxelGrid, fibonacci_sphere
 from wheretolook.geometry.poses import poses_looking_along, rotation_looking_along

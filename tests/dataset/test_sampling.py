@@ -6,8 +6,8 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from synthetic_dataset import make_landmarks
+from wheretolook.dataset.config import SampleConfig
 from wheretolook.dataset.sampling import sample_viewpoints
-from wheretolook.dataset.sampling_config import SampleConfig
 from wheretolook.dataset.viewpoint_files import SCHEMA
 from wheretolook.dataset.viewpoint_table import poses
 from wheretolook.geometry.camera import PinholeCamera

@@ -13,8 +13,8 @@ from wheretolook.cli import main, parse_command
 from wheretolook.commands.evaluate import evaluate_methods
 from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.holdout.holdout import hold_out_blocks
-from wheretolook.holdout.holdout_views import evaluated_photographs
 from wheretolook.holdout.photo_map import WORK, open_map
+from wheretolook.holdout.scores import evaluated_photographs
 from wheretolook.mapping.config import FrameOptions
 from wheretolook.scorers.set.network import SetNetwork
 from wheretolook.tracking.runs import finished_runs

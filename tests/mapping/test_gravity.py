@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from mapping.marker_rooms import rolled
 from wheretolook.geometry.poses import poses_looking_along
-from wheretolook.mapping.gravity import estimate_gravity
+from wheretolook.mapping.map_frame import estimate_gravity
 
 TURN = Rotation.from_euler("xyz", [40, -65, 110], degrees=True).as_matrix()
 """From the world to the arbitrary frame of a mapping."""

@@ -16,7 +16,7 @@ from wheretolook.commands.label import Label
 from wheretolook.commands.map import BuildMap
 from wheretolook.commands.sample import Sample
 from wheretolook.commands.viewpoint_map import BuildViewpointMap
-from wheretolook.dataset.sampling_config import SampleConfig
+from wheretolook.dataset.config import SampleConfig
 from wheretolook.dataset.viewpoint_table import UNLABELLED, poses
 from wheretolook.geometry.poses import camera_centers
 from wheretolook.mapping import photograph_map as incremental

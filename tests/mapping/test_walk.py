@@ -1,5 +1,6 @@
 """Walks in rooms whose free space is known in closed form."""
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -7,6 +8,7 @@ import pytest
 
 from mapping.conftest import BoxFreeSpace
 from wheretolook.mapping import rendered_map as walk
+from wheretolook.mapping.config import WALK
 from wheretolook.mapping.rendered_map import plan_walk
 from wheretolook.utils.errors import ConfigError, SceneError
 
@@ -67,8 +69,8 @@ def test_walk_is_free_and_covers_what_was_asked(seed, coverage):
 
 
 def test_poses_are_spaced_evenly_along_the_walk_and_look_ahead(monkeypatch):
-    for name, value in (("PITCH_VARIATION_DEG", 8.0), ("SWING_DEG", 30.0), ("PITCH_DEG", -4.0)):
-        monkeypatch.setattr(walk, name, value)
+    style = replace(WALK, pitch_variation_deg=8.0, swing_deg=30.0, pitch_deg=-4.0)
+    monkeypatch.setattr(walk, "WALK", style)
     route = plan_walk(two_rooms(door_m=1.2), BOUNDS, 120, 3)
     assert route.positions.shape == route.directions.shape == (120, 3)
     np.testing.assert_allclose(np.linalg.norm(route.directions, axis=1), 1, atol=1e-9)
@@ -103,7 +105,7 @@ def test_only_the_largest_reachable_part_is_walked():
 
 
 def test_walk_climbs_to_another_storey(monkeypatch):
-    monkeypatch.setattr(walk, "EYE_HEIGHT_VARIATION_M", 0.1)
+    monkeypatch.setattr(walk, "WALK", replace(WALK, eye_height_variation_m=0.1))
     scene = TwoStoreys(SIZE, 0.2)
     bounds = np.array([(0, 0, 0), (8, 6, 5.2)])
     route = plan_walk(scene, bounds, 300, 1, coverage=0.95)
@@ -117,10 +119,10 @@ def test_walk_climbs_to_another_storey(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("name", "value", "clearance_m"), [("CELL_M", 0.3, 3.1), ("EYE_HEIGHT_M", 5.0, 0.2), ("CELL_M", 5.5, 0.2)]
+    ("name", "value", "clearance_m"), [("cell_m", 0.3, 3.1), ("eye_height_m", 5.0, 0.2), ("cell_m", 5.5, 0.2)]
 )
 def test_scenes_without_a_floor_are_rejected(name, value, clearance_m, monkeypatch):
-    monkeypatch.setattr(walk, name, value)
+    monkeypatch.setattr(walk, "WALK", replace(WALK, **{name: value}))
     with pytest.raises(SceneError):
         plan_walk(two_rooms(door_m=1.2, clearance_m=clearance_m), BOUNDS, 10)
 

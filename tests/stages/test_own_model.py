@@ -19,8 +19,8 @@ from wheretolook.commands.map import BuildMap
 from wheretolook.commands.options import extractor_of, select_options
 from wheretolook.commands.sample import Sample
 from wheretolook.commands.viewpoint_map import BuildViewpointMap
+from wheretolook.dataset.config import SampleConfig
 from wheretolook.dataset.layout import Dataset, SceneFolder
-from wheretolook.dataset.sampling_config import SampleConfig
 from wheretolook.dataset.scene import Scene
 from wheretolook.features.extractor import ExtractorConfig
 from wheretolook.geometry.camera import CameraConfig, PinholeCamera

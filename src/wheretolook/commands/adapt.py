@@ -219,8 +219,7 @@ class Adapt(SceneOptions, LabelOptions, FrameOptions):
         self, model: Path, name: str, occlusion: OcclusionModel, weights: Path, log: Log
     ) -> tuple[LocalizedViews, LocalizationMap]:
         """Return a map's photographs, held out in blocks that `wheretolook check` shares, and the whole map."""
-        from wheretolook.holdout.holdout_views import photographed_views
-        from wheretolook.holdout.scores import whole_map
+        from wheretolook.holdout.scores import photographed_views, whole_map
 
         log(f"{name}: holding out blocks of photographs")
         photographs, held_out = hold_out_photographs(

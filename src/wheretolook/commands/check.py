@@ -158,9 +158,8 @@ class Check(ScorerOptions, FrameOptions):
             model_suffix(self.map)
         # the imports above are light, those below take seconds
         from wheretolook.figures.style import save_figure
-        from wheretolook.holdout.figure import check_figure
         from wheretolook.holdout.photo_map import WORK, folder_of_check
-        from wheretolook.holdout.report import check_map
+        from wheretolook.holdout.report import check_figure, check_map
         from wheretolook.holdout.scores import Scoring
 
         device = usable_device(self.device)

@@ -89,7 +89,7 @@ def list_methods() -> None:
 
 def held_out_photographs(options: Evaluate, dataset: Dataset, log: Log) -> list[HeldOutPhotographs]:
     """Hold the photographs of the maps of a split's scenes out of these maps."""
-    from wheretolook.holdout.holdout_views import evaluated_photographs
+    from wheretolook.holdout.scores import evaluated_photographs
 
     held_out = []
     for files in filter(knows_photographs, dataset.split(options.evaluate.split)):

@@ -10,9 +10,8 @@ from functools import wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeVar, get_args
 
-from wheretolook.dataset.config import RELEASE_FILE
+from wheretolook.dataset.config import RELEASE_FILE, SampleConfig
 from wheretolook.dataset.layout import Dataset
-from wheretolook.dataset.sampling_config import SampleConfig
 from wheretolook.dataset.scene import Scene, SceneConfig
 from wheretolook.features.extractor import ExtractorConfig
 from wheretolook.geometry.camera import Camera, CameraConfig, describe_camera, parse_camera

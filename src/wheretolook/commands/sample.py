@@ -9,9 +9,9 @@ import numpy as np
 
 from wheretolook.commands.map import SceneOrMapOptions, imports_map
 from wheretolook.commands.options import Log, Progress, existing, ignore_progress, load_dataset, naming_file, open_scene
+from wheretolook.dataset.config import SampleConfig
 from wheretolook.dataset.dataset_lock import changes_dataset
 from wheretolook.dataset.layout import Dataset
-from wheretolook.dataset.sampling_config import SampleConfig
 from wheretolook.dataset.scene import Scene
 from wheretolook.geometry.camera import Camera, draw_camera, write_cameras
 from wheretolook.mapping.colmap_model import colmap_poses

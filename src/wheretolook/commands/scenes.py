@@ -19,9 +19,9 @@ from wheretolook.commands.options import (
     mesh_fingerprint,
     refuse_release,
 )
+from wheretolook.dataset.config import Split
 from wheretolook.dataset.dataset_lock import changes_dataset
 from wheretolook.dataset.layout import Dataset, MappedFloor, SceneFolder
-from wheretolook.dataset.sampling_config import Split
 from wheretolook.scenes.config import ApartmentConfig, SceneKind
 from wheretolook.utils.errors import ConfigError, SceneError, TableError
 from wheretolook.utils.files import ArtifactCache, cache_key, storage_errors

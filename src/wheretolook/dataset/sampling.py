@@ -3,31 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
-from wheretolook.dataset.sampling_config import SampleConfig
+from wheretolook.dataset.config import SampleConfig
 from wheretolook.dataset.viewpoint_table import CAMERA_ID, UNLABELLED, pose_columns
 from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.lattices import VoxelGrid
 from wheretolook.geometry.poses import Float, camera_centers, poses_looking_along, rotation_looking_along
 from wheretolook.mapping.landmarks import Landmarks
+from wheretolook.space.free_space import FreeSpace
+from wheretolook.space.mapped_space import MappedSpace
 from wheretolook.utils.devices import fitting
 from wheretolook.utils.errors import ConfigError, SceneError
 from wheretolook.visibility.counting import Survey, SurveyOptions, survey
 from wheretolook.visibility.occlusion import OcclusionModel, StoredOcclusion
-
-NEAR_M = 0.2  # standard deviation along each axis of a location near a mapping image
-NEAR_DEG = 40.0  # largest angle between its directions and that of the image
-BYTES_PER_VIEWPOINT = 600  # while a table of viewpoints is made and written
-
-if TYPE_CHECKING:
-    from wheretolook.space.free_space import FreeSpace
-    from wheretolook.space.mapped_space import MappedSpace
 
 
 def free_locations(grid: VoxelGrid, free_space: FreeSpace | MappedSpace) -> NDArray[np.int64]:
@@ -123,7 +116,7 @@ def sample_viewpoints(
 def _near_map(locations: Float, mapped: Float, count: int, rng: np.random.Generator) -> NDArray[np.int64]:
     """Draw rows of at most `count` locations (L, 3), each nearest to a point near a random mapping image."""
     centers = camera_centers(mapped)[rng.integers(len(mapped), size=count)]
-    return np.unique(cKDTree(locations).query(centers + rng.normal(0, NEAR_M, centers.shape))[1])
+    return np.unique(cKDTree(locations).query(centers + rng.normal(0, 0.2, centers.shape))[1])
 
 
 def _along_map(
@@ -131,7 +124,7 @@ def _along_map(
 ) -> list[NDArray[np.int64]]:
     """Keep, at locations (L, 3) that are `near` (L,), only directions like that of the nearest mapping image."""
     nearest = cKDTree(camera_centers(mapped)).query(locations)[1]
-    like = directions @ mapped[nearest, 2, :3].T > np.cos(np.radians(NEAR_DEG))
+    like = directions @ mapped[nearest, 2, :3].T > np.cos(np.radians(40))
     return [
         seen[like[seen, row]] if is_near else seen
         for row, (seen, is_near) in enumerate(zip(visible, near, strict=True))
@@ -144,7 +137,7 @@ def _check_number(n_viewpoints: int, n_locations: int, max_count: int, n_landmar
         fix = "Lower sample.min_visible, or map the scene with more images."
         problem = f"from no location does a viewpoint see {config.min_visible} of the {n_landmarks} landmarks"
         raise SceneError(problem, value=max_count, fix=fix)
-    most = fitting(BYTES_PER_VIEWPOINT)
+    most = fitting(600)  # while a table is made and written
     if n_viewpoints > most:
         fix = f"Set sample.max_directions to {max(1, most // n_locations):,} or less, or sample.max_locations."
         raise ConfigError("the table has more viewpoints than there is memory for", value=n_viewpoints, fix=fix)

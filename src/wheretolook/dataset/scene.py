@@ -14,7 +14,9 @@ from numpy.typing import NDArray
 from wheretolook.dataset.layout import SceneFolder
 from wheretolook.geometry.camera import Camera, cameras_by_id, only_camera
 from wheretolook.geometry.lattices import ViewLattice, VoxelGrid
+from wheretolook.geometry.mesh import TexturedMesh
 from wheretolook.geometry.poses import Float, camera_centers
+from wheretolook.geometry.tsdf import DepthImage, DepthImages, TsdfConfig, TsdfVolume
 from wheretolook.mapping.colmap_model import colmap_poses, read_model
 from wheretolook.mapping.config import FrameOptions, place_name
 from wheretolook.mapping.landmarks import Landmarks
@@ -26,8 +28,6 @@ from wheretolook.utils.errors import ConfigError, check_positive
 from wheretolook.visibility.config import OCCLUSION_MODELS, OcclusionConfig, check_occlusion_names
 
 if TYPE_CHECKING:  # pandas, torch and Warp are imported when first needed
-    from wheretolook.geometry.mesh import TexturedMesh
-    from wheretolook.geometry.tsdf import DepthImage, DepthImages, TsdfVolume
     from wheretolook.inputs.localization_map import LocalizationMap
     from wheretolook.rendering.raycasting import MeshRaycaster
     from wheretolook.rendering.warp_renderer import Renderer
@@ -270,8 +270,6 @@ class Scene:
     @cached_property
     def tsdf_volume(self) -> TsdfVolume:
         """The truncated signed distance field fused from the depth images."""
-        from wheretolook.geometry.tsdf import TsdfConfig, TsdfVolume
-
         occlusion = self.config.occlusion
         tsdf = TsdfConfig(voxel_size_m=occlusion.voxel_m, max_depth_m=occlusion.max_depth_m)
         return TsdfVolume.from_images(self.depth_images, tsdf, self.progress)
@@ -351,7 +349,6 @@ class RenderedDepth:
         return len(self.cam_from_world)
 
     def __getitem__(self, index: int) -> DepthImage:
-        from wheretolook.geometry.tsdf import DepthImage
 
         pose = self.cam_from_world[index]
         return DepthImage(self.renderer.render(self.camera, pose[None]).depth_m[0], self.camera, pose)

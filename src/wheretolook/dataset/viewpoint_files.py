@@ -7,6 +7,7 @@ matched can be stored too, see `MATCH_FIELDS`.
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -21,18 +22,33 @@ from wheretolook.utils.files import atomic_write, open_parquet
 
 CENTER_COLUMNS = ("x_m", "y_m", "z_m")
 
-_COLUMNS = {"viewpoint_id": pa.int64(), "location_id": pa.int32(), "direction_id": pa.int32()}
-_COLUMNS |= dict.fromkeys(POSE_COLUMNS, pa.float64())
-_COLUMNS |= {"n_visible": pa.int32(), "visibility_rank": pa.int32(), "status": pa.string()}
-_COLUMNS |= {"error_m": pa.float32(), "error_deg": pa.float32(), "n_inliers": pa.int32()}
-SCHEMA = pa.schema(_COLUMNS)
+SCHEMA = pa.schema(
+    [
+        ("viewpoint_id", pa.int64()),
+        ("location_id", pa.int32()),
+        ("direction_id", pa.int32()),
+        *((name, pa.float64()) for name in POSE_COLUMNS),
+        ("n_visible", pa.int32()),
+        ("visibility_rank", pa.int32()),
+        ("status", pa.string()),
+        ("error_m", pa.float32()),
+        ("error_deg", pa.float32()),
+        ("n_inliers", pa.int32()),
+    ]
+)
 """Columns of `viewpoints.parquet`. The pose is cam_from_world (quaternion wxyz, translation in metres), rank 0 is the
 direction that sees most landmarks at its location. Until a viewpoint is labelled its status is "unlabelled"; afterwards
 it is "localized", "too_few_matches" or "no_pose". Errors are those of the pose that RANSAC found, even if it has too
 few inliers to be accepted ("no_pose"); NaN if there is none."""
 
-_COMPACT_NAMES = dict(zip(TRANSLATION_COLUMNS, CENTER_COLUMNS, strict=True))
-COMPACT_SCHEMA = pa.schema([field.with_name(_COMPACT_NAMES.get(field.name, field.name)) for field in SCHEMA])
+COMPACT_SCHEMA = pa.schema(
+    [
+        field.with_name(CENTER_COLUMNS[TRANSLATION_COLUMNS.index(field.name)])
+        if field.name in TRANSLATION_COLUMNS
+        else field
+        for field in SCHEMA
+    ]
+)
 """Columns of a compact table: in place of the translation, which differs in every row, the camera's centre in the world
 (metres), which the viewpoints of a location share. The translation follows: t = -R c."""
 
@@ -44,30 +60,16 @@ PIXEL_FIELD = pa.schema([(PIXELS, pa.list_(pa.float32()))])
 """An optional ragged column of a table with `MATCH_FIELDS`: x and y, alternating, of the pixels of `matched_rows`, in
 their order. With it several views of a location can be localized together (`looks/`)."""
 
-CAMERA_FIELD = pa.schema([(CAMERA_ID, pa.int32())])
-"""An optional column of a scene whose viewpoints have several cameras: the camera's number in `cameras.txt`."""
-
 FIRST_FIELDS = pa.schema([SCHEMA.field(name).with_name(f"{FIRST}{name}") for name in LABELS])
 """Optional columns of a table labelled by several hypotheses: status, errors and inliers of the first RANSAC result,
 exactly as `LocalizerConfig.method` "first" labels."""
 
-APPEARANCE_FIELD = pa.schema([(APPEARANCE, pa.float32())])
-"""An optional column of labels made with `label.appearance`: the strength at which each view's image was changed."""
-
-CHANGES_FIELD = pa.schema([(CHANGES, pa.float32())])
-"""An optional column of labels made with `label.changes`: the strength at which the scene of each view was changed."""
-
-OPTIONAL_FIELDS = (CAMERA_FIELD, FIRST_FIELDS, APPEARANCE_FIELD, CHANGES_FIELD)
-"""Optional columns that compact tables keep, too."""
-
-CENTER_DECIMALS = 12  # of a metre; the centres of a location's viewpoints, each computed from its pose, differ by less
-
-_ENCODINGS = {"viewpoint_id": "DELTA_BINARY_PACKED", "error_m": "BYTE_STREAM_SPLIT", "error_deg": "BYTE_STREAM_SPLIT"}
-_COMPACT_FORMAT = {
-    "compression_level": 19,
-    "use_dictionary": [name for name in COMPACT_SCHEMA.names if name not in _ENCODINGS],  # they repeat few values
-    "column_encoding": _ENCODINGS,
-}
+OPTIONAL_FIELDS = pa.schema(
+    [(CAMERA_ID, pa.int32()), *FIRST_FIELDS, (APPEARANCE, pa.float32()), (CHANGES, pa.float32())]
+)
+"""Optional columns, which compact tables keep, too: the camera's number in `cameras.txt` where viewpoints have several;
+`FIRST_FIELDS`; the strengths at which each view's image (`label.appearance`), or its scene (`label.changes`), was
+changed."""
 
 
 def write_table(table: pd.DataFrame, path: Path, compact: bool = False) -> None:
@@ -78,12 +80,17 @@ def write_table(table: pd.DataFrame, path: Path, compact: bool = False) -> None:
     """
     if compact:
         table = table.assign(**dict(zip(CENTER_COLUMNS, _shared_centers(table).T, strict=True)))
-    optional = [*OPTIONAL_FIELDS, *([] if compact else [MATCH_FIELDS, PIXEL_FIELD])]
-    extra = [field for part in optional if {*part.names} <= {*table} for field in part]
+    optional = [*OPTIONAL_FIELDS, *(() if compact else (*MATCH_FIELDS, *PIXEL_FIELD))]
+    extra = [field for field in optional if field.name in table]
     schema = pa.schema([*(COMPACT_SCHEMA if compact else SCHEMA), *extra])
     content = pa.Table.from_pandas(table, schema=schema, preserve_index=False)
     content = content.replace_schema_metadata(None)  # it describes the data frame, not the rows
-    options = _COMPACT_FORMAT if compact else {}
+    options: dict[str, Any] = {}
+    if compact:
+        encodings = {"viewpoint_id": "DELTA_BINARY_PACKED"}
+        encodings |= dict.fromkeys(("error_m", "error_deg"), "BYTE_STREAM_SPLIT")
+        repeated = [name for name in COMPACT_SCHEMA.names if name not in encodings]  # few values
+        options = {"compression_level": 19, "use_dictionary": repeated, "column_encoding": encodings}
     with atomic_write(path) as partial:
         pq.write_table(content, partial, compression="zstd", write_page_checksum=True, **options)
 
@@ -93,8 +100,8 @@ def _shared_centers(table: pd.DataFrame) -> Float:
     centers = camera_centers(poses(table))
     _, first, rows = np.unique(table["location_id"], return_index=True, return_inverse=True)
     shared = centers[first][rows]
-    apart = np.abs(shared - centers) > 0.5 * 10.0**-CENTER_DECIMALS  # a location with several centres keeps them
-    return np.round(np.where(apart, centers, shared), CENTER_DECIMALS) + 0.0  # no negative zero
+    apart = np.abs(shared - centers) > 0.5e-12  # a location with several centres keeps them
+    return np.round(np.where(apart, centers, shared), 12) + 0.0  # no negative zero
 
 
 def has_matches(path: Path, pixels: bool = False) -> bool:
@@ -121,8 +128,7 @@ def read_table(path: Path, matches: bool = False, pixels: bool = False) -> pd.Da
         with open_parquet(path, page_checksum_verification=True) as file:
             stored = {*file.schema_arrow.names}
             compact = not stored.isdisjoint(CENTER_COLUMNS)
-            optional = [part for part in OPTIONAL_FIELDS if {*part.names} <= stored]
-            extra = [field for part in optional for field in part] + requested
+            extra = [field for field in OPTIONAL_FIELDS if field.name in stored] + requested
             schema = pa.schema([*(COMPACT_SCHEMA if compact else SCHEMA), *extra])
             if missing := [name for name in schema.names if name not in stored]:
                 if requested:

@@ -9,11 +9,10 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from wheretolook.dataset.config import ALL, THRESHOLDS, threshold_key
+from wheretolook.dataset.config import ALL, THRESHOLDS, Split, threshold_key
 from wheretolook.dataset.config import LOCALIZED as LOCALIZED
 from wheretolook.dataset.config import NO_POSE as NO_POSE
 from wheretolook.dataset.config import TOO_FEW_MATCHES as TOO_FEW_MATCHES
-from wheretolook.dataset.sampling_config import Split
 from wheretolook.geometry.pose_files import POSE_COLUMNS, pose_values, poses_of_values
 from wheretolook.geometry.poses import Float, camera_centers
 from wheretolook.utils.errors import TableError
@@ -102,10 +101,11 @@ def _views(scene: str, table: pd.DataFrame, split: str, both: bool) -> pd.DataFr
     """The columns that the summary needs, with heights and the label at each threshold."""
     height = camera_centers(poses(table))[:, 2]
     height = np.round(height - height.min(), 6)  # so that all views of a location fall into one band
-    labels = {name: is_good(table, *limits) for name, limits in zip(POSITIVE, THRESHOLDS, strict=True)}
-    if both:
-        first = by_first(table)
-        labels |= {f"{FIRST}{name}": is_good(first, *limits) for name, limits in zip(POSITIVE, THRESHOLDS, strict=True)}
+    labels = {}
+    labelled = {"": table, FIRST: by_first(table)} if both else {"": table}
+    for prefix, by in labelled.items():
+        for name, (error_m, error_deg) in zip(POSITIVE, THRESHOLDS, strict=True):
+            labels[f"{prefix}{name}"] = is_good(by, error_m, error_deg)
     columns = table[["location_id", "n_visible", "status", "error_m", "error_deg"]]
     return columns.assign(scene=scene, split=split, height_m=height, **labels)
 

@@ -12,6 +12,8 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+import pycolmap
+import torch
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from tqdm.auto import tqdm
@@ -30,15 +32,12 @@ from wheretolook.utils.errors import MapError, MapWarning
 from wheretolook.utils.files import ArtifactCache, cache_key
 from wheretolook.utils.processes import WorkerPool
 
-PARTS = 8  # blocks that partition the photographs
-SPREAD = 4.0  # ratio of the sizes of the largest and the smallest
 KEPT = tuple(LocalizerConfig().min_inliers * share for share in (16, 8, 4, 2))
 """Landmarks that the rest may still have of what a photograph observes, at the quantile `COVERED_WORSE` of each grown
 block: from plenty for a pose to hardly enough, since not all are matched again."""
 COVERED_WORSE = 0.25
 MIN_REST = 0.1  # share of the photographs that is never held out
 MIN_LANDMARKS = 50  # of a map without a block
-SAME = 0.95  # intersection over union from which on two blocks are the same
 VIEWS = 60  # maximum number of photographs of a block that are localized; then evenly spread ones
 _GOLDEN = 0.6180339887
 
@@ -109,14 +108,14 @@ def _spread(n: int, max_count: int) -> NDArray[np.int64]:
 
 
 def _same(one: NDArray[np.int64], other: NDArray[np.int64]) -> bool:
-    return len(np.intersect1d(one, other)) >= SAME * len(np.union1d(one, other))
+    return len(np.intersect1d(one, other)) >= 0.95 * len(np.union1d(one, other))
 
 
 def _partition(share: Float, places: Float) -> list[NDArray[np.int64]]:
     """Partition all frames into blocks of neighbours; each grows from the frame least connected with the rest."""
     n = len(share)
-    count = max(2, min(PARTS, n // 2))
-    weights = SPREAD ** (np.arange(count) / max(1, count - 1))
+    count = max(2, min(8, n // 2))
+    weights = 4.0 ** (np.arange(count) / max(1, count - 1))  # the largest block is four times the smallest
     weights = weights[np.argsort(np.arange(1, count + 1) * _GOLDEN % 1, kind="stable")]  # large and small mixed
     ends = np.rint(np.cumsum(weights) / weights.sum() * n).astype(int)
     free = np.ones(n, dtype=bool)
@@ -180,9 +179,6 @@ def _landmarks_without(observes: csr_array, group: NDArray[np.int64]) -> int:
 
 
 MIN_ANGLE_DEG = 1.5  # COLMAP's own minimum angle between the rays of a landmark
-_FORMAT = 4  # version of what is cached of a block
-_LANDMARKS = "landmarks.npz"
-_VIEWS = "views.json"
 
 
 @dataclass(frozen=True, eq=False)
@@ -224,7 +220,7 @@ def hold_out_blocks(
     """
     blocks = choose_blocks(source) if blocks is None else blocks
     limits = [source.limit_m.tolist(), MAX_ERROR_DEG, MIN_ANGLE_DEG, asdict(LocalizerConfig()), source.fov_deg]
-    key = cache_key(_FORMAT, versions(), source.key, limits)
+    key = cache_key(4, versions(), source.key, limits)  # version of what is cached of a block
     folder = work / f"blocks-{key}"
     for old in work.glob("blocks-*"):
         if old.is_dir() and old != folder:
@@ -269,8 +265,6 @@ def without(model: Any, image_ids: Sequence[int]) -> Any:
     again from the others; it is dropped if it has fewer than two, if its rays meet at less than `MIN_ANGLE_DEG`, or if
     it reprojects worse than any landmark of the whole map.
     """
-    import pycolmap
-
     rest = pycolmap.Reconstruction(model)
     before = {number: point.track.length() for number, point in rest.points3D.items()}
     worst_px = max((point.error for point in rest.points3D.values() if point.has_error()), default=np.inf)
@@ -303,8 +297,6 @@ def _model(folder: Path) -> Any:
 
 def _run(job: _BlockJob) -> None:
     """Hold out a block, localize its photographs, and store the result."""
-    import torch
-
     torch.set_num_threads(1)
     whole = _model(job.model)
     image_ids = job.source.arrays.image_ids
@@ -324,8 +316,8 @@ def _run(job: _BlockJob) -> None:
     )
     job.cache.folder.mkdir(parents=True, exist_ok=True)
     job.cache.clear()
-    replace(landmarks, descriptors=None).save(job.cache.folder / _LANDMARKS)
-    job.cache.store({_VIEWS: views.to_dict("list")})
+    replace(landmarks, descriptors=None).save(job.cache.folder / "landmarks.npz")
+    job.cache.store({"views.json": views.to_dict("list")})
 
 
 def _observed(image: Any, source: PhotographedMap, row: int, crop: int) -> NDArray[np.int64]:
@@ -373,10 +365,10 @@ def _localize(job: _BlockJob, landmarks: Landmarks) -> pd.DataFrame:
 
 def _load(cache: ArtifactCache, block: Block) -> HoldoutResult | None:
     """Read the cached result of a block; None if there is none, or it is unreadable."""
-    results = cache.load(_VIEWS)
+    results = cache.load("views.json")
     if results is None:
         return None
     try:
-        return HoldoutResult(block, Landmarks.load(cache.folder / _LANDMARKS), pd.DataFrame(results[_VIEWS]))
+        return HoldoutResult(block, Landmarks.load(cache.folder / "landmarks.npz"), pd.DataFrame(results["views.json"]))
     except (MapError, ValueError):
         return None

@@ -20,7 +20,6 @@ from wheretolook.evaluation.statistics import BINS, ClusterBootstrap, bins_of, d
 from wheretolook.geometry.poses import Float
 
 RESAMPLES = 2000
-BLOCKS = 11  # of a check of many photographs, at least
 
 
 def resampled_auc(bootstrap: ClusterBootstrap, good: NDArray[np.bool_], score: Float, within: bool = False) -> Float:
@@ -149,7 +148,7 @@ def _record(
 ) -> dict[str, float | None]:
     """Return value and 95 % interval of statistics (1 + R,) of the views and of each resample; None where unknown.
 
-    Resampling few blocks makes intervals too narrow: they are widened as Student's quantile exceeds that of `BLOCKS`
+    Resampling few blocks makes intervals too narrow: they are widened as Student's quantile exceeds that of 11
     blocks, within `least` and `most`. `blocks` are those that decide the statistic, by default all; one decides nothing.
     """
     count = bootstrap.n_clusters if blocks is None else blocks
@@ -158,7 +157,7 @@ def _record(
     if count < 2:
         low, high = (np.where(np.isfinite(value), end, np.nan) for end in (least, most))
     else:
-        quantiles = student.ppf(0.975, np.array([count, BLOCKS]) - 1)
+        quantiles = student.ppf(0.975, np.array([count, 11]) - 1)
         wider = max(1.0, quantiles[0] / quantiles[1])
         low, high = (np.clip(value + wider * (end - value), least, most) for end in (low, high))
     named = {"value": value, "low": low, "high": high}

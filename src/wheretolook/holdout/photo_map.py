@@ -30,6 +30,7 @@ from wheretolook.mapping.colmap_model import (
 from wheretolook.mapping.config import FrameOptions, ImportConfig, place_name
 from wheretolook.mapping.feature_files import DATABASE_FILE, read_descriptors
 from wheretolook.mapping.georeference import DEPTH_M, median_depths
+from wheretolook.mapping.imported_map import map_existing
 from wheretolook.mapping.landmarks import load_colmap_landmarks
 from wheretolook.mapping.map import Map, find_features, find_photographs
 from wheretolook.mapping.map_frame import IDENTITY, MapFrame, find_frame, has_photographs
@@ -68,14 +69,9 @@ def crop_pixels(camera: Camera, pixels: Float, fov_deg: float, crop: int) -> tup
 
 
 MAX_ERROR_M, MAX_ERROR_DEG = THRESHOLDS[0]  # below both, a photograph counts as localized
-MAX_ERROR_OF_DEPTH = MAX_ERROR_M / DEPTH_M  # instead, where metres are unknown: of the photograph's median depth
-PLACE_OF_DEPTH = 0.1
-"""Views whose cameras are within this share of the map's median depth (0.5 m in a room of 5 m) share a place: what can
-be seen hardly changes within it, so that mostly the direction decides."""
 CHECKS = "checks"  # folder of the folders of checks, next to the datasets
 WORK = "work"  # folder of cached work, in that of a check
 MIN_PHOTOGRAPHS = 8  # with fewer, blocks are too small
-MIN_OBSERVED = 10  # landmarks that the median photograph observes
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,12 +169,13 @@ class PhotographedMap:
         if self.is_metric:
             return np.full(len(self.poses), MAX_ERROR_M)
         typical = float(np.nanmedian(self.depth_m))
-        return MAX_ERROR_OF_DEPTH * np.where(np.isfinite(self.depth_m), self.depth_m, typical)
+        return MAX_ERROR_M / DEPTH_M * np.where(np.isfinite(self.depth_m), self.depth_m, typical)
 
     @property
     def place_radius(self) -> float:
         """Maximum distance in m of the cameras of views that share a place."""
-        return PLACE_OF_DEPTH * (DEPTH_M if not self.is_metric else float(np.nanmedian(self.depth_m)))
+        # 0.5 m in a room of 5 m, within which mostly the direction decides
+        return 0.1 * (DEPTH_M if not self.is_metric else float(np.nanmedian(self.depth_m)))
 
     @property
     def is_turned(self) -> bool:
@@ -215,8 +212,9 @@ def open_map(
     arrays = model_arrays(model)
     own_centers = camera_centers(arrays.image_poses)
     observed = float(np.median(np.bincount(arrays.observation_image, minlength=len(own_centers))))
-    if observed < MIN_OBSERVED:
-        problem = f"half of the photographs observe fewer than {MIN_OBSERVED} landmarks"
+    min_observed = 10
+    if observed < min_observed:
+        problem = f"half of the photographs observe fewer than {min_observed} landmarks"
         fix = "Give a model with tracks, and the photographs it was made from."
         raise MapError(problem, path=model_dir, value=observed, fix=fix)
     original = model if source in (None, model_dir) else read_model(source)
@@ -289,7 +287,6 @@ def features_of(
     if images is None:
         fix = "Give --database, the database.db that it was built from, or --images, the folder of its photographs."
         raise MapError("neither the features nor the photographs of this map are known", path=model_dir, fix=fix)
-    from wheretolook.mapping.imported_map import map_existing
 
     out = work / "map"
     files = size_and_time(path for name in registered_names(model).values() if (path := images / name).is_file())

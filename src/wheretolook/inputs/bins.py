@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -13,15 +13,11 @@ from numpy.typing import NDArray
 from wheretolook.geometry.camera import ColmapCamera, PinholeCamera
 from wheretolook.geometry.poses import split_poses
 from wheretolook.inputs.channels import ALL_CHANNELS, CHANNELS
-from wheretolook.mapping.landmarks import MAP_ATTRIBUTES
+from wheretolook.mapping.landmarks import MAP_ATTRIBUTES, Landmarks
 from wheretolook.utils.warp import start_warp
 from wheretolook.visibility import frustum
 from wheretolook.visibility.frustum import PosedViews
 from wheretolook.visibility.frustum_kernel import ViewBatch, dot, entry_offset, in_view, pixel_of
-
-if TYPE_CHECKING:
-    from wheretolook.mapping.landmarks import Landmarks
-
 
 # mypy: ignore-errors
 # Warp's kernel language is not Python's type system.
@@ -122,7 +118,6 @@ def count_bins_kernel(
     wp.atomic_add(n_filled, view, filled)
 
 
-GPU_LANES = 32  # threads that share a view on a GPU where bins are only counted
 BLOCK_BYTES = 1 << 30  # of bins that are computed at a time
 
 
@@ -194,7 +189,7 @@ def count_bins(posed: PosedViews, bins: int = 30, device: str = "cpu") -> tuple[
         binned = bin_views_plain(posed, bins)
         return binned.n_visible, binned.n_filled
     device = start_warp(device)
-    lanes = GPU_LANES if device != "cpu" else 1
+    lanes = 32 if device != "cpu" else 1  # threads share a view
     numbers = np.empty((2, len(posed.cam_from_world)), dtype=np.int32)
     for rows, views, grid in _blocks(posed, bins, device, 1):
         n = rows.stop - rows.start

@@ -153,12 +153,6 @@ def _thinned(starts: Tensor, indices: Tensor, limit: int) -> tuple[NDArray[np.in
     return new.numpy(), indices[first + place * length // count]
 
 
-TOO_FAR = 2.0  # distance over the mean mapping distance
-TOO_OBLIQUE_DEG = 45.0  # angle to the mean mapping direction
-REPEATED = 0.95  # cosine between the descriptor and the nearest one of another landmark
-"""Limits of a landmark, beyond which the bundled weights expect it to be detected about half as often, or less."""
-
-
 class ReasonCounter:
     """Counts the landmarks of a map that are hard to match in views of it, by reason."""
 
@@ -179,7 +173,8 @@ class ReasonCounter:
             if self._unoccluded is not None:
                 n_occluded[rows] -= n_visible.cpu().numpy()
             ratio, cosine, ambiguity = described.values.unbind(1)
-            limits = ratio > log(TOO_FAR), cosine < cos(radians(TOO_OBLIQUE_DEG)), ambiguity > REPEATED
+            # beyond these, the bundled weights expect landmarks to be detected about half as often, or less
+            limits = ratio > log(2.0), cosine < cos(radians(45)), ambiguity > 0.95
             hard = torch.stack(limits, 1).double()
             sums = torch.segment_reduce(hard, "sum", lengths=described.counts, axis=0, initial=0.0)
             counts[rows] = sums.cpu().numpy()

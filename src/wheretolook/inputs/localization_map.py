@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import warp as wp
 from numpy.typing import NDArray
 
 from wheretolook.geometry.camera import Camera, ColmapCamera
@@ -16,17 +17,14 @@ from wheretolook.mapping.config import FrameOptions
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.mapping.map import Map
 from wheretolook.mapping.map_frame import MapFrame, warn_of_mesh
+from wheretolook.space.free_space import FreeSpace
 from wheretolook.utils.errors import check_positive
 from wheretolook.visibility import frustum
 from wheretolook.visibility.frustum import LandmarkSets, PosedViews, in_view_by_table, landmarks_in_view
-from wheretolook.visibility.occlusion import NoOcclusion, OcclusionModel
+from wheretolook.visibility.occlusion import MeshOcclusion, NoOcclusion, OcclusionModel
 
 if TYPE_CHECKING:
     from torch import Tensor
-
-SAME_LOCATION_DECIMALS = 6  # camera centres that agree to this many decimals of a metre share one visibility test
-MIN_LINES_FOR_TABLE = 1_000_000
-"""Lines of sight from which on a COLMAP camera's field of view is tabulated, which takes about a second."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,8 +76,6 @@ class LocalizationMap:
         camera = opened.camera(camera)
         if mesh is not None:
             from wheretolook.scenes.loading import load_mesh
-            from wheretolook.space.free_space import FreeSpace
-            from wheretolook.visibility.occlusion import MeshOcclusion
 
             to_world = opened.frame.world_from_map
             space = FreeSpace(load_mesh(Path(mesh), colored=False).transformed(to_world), device=device)
@@ -127,13 +123,13 @@ class LocalizationMap:
     def in_view_on_device(self, cam_from_world: Float) -> tuple[NDArray[np.int64], Tensor]:
         """Return the visible landmarks of views (B, 3, 4) as starts (B + 1,) and indices int32 on the map's device."""
         import torch  # takes seconds to load
-        import warp as wp
 
         views = self._views(cam_from_world)
         if not isinstance(self.camera, ColmapCamera):
             starts, indices = frustum.in_view_on_device(views, self._points_on_device, self.device)
             return starts.astype(np.int64), wp.to_torch(indices)
-        if int(np.diff(views.unoccluded.starts)[views.location_rows].sum()) >= MIN_LINES_FOR_TABLE:
+        # lines of sight: tabulating the field of view takes about a second
+        if int(np.diff(views.unoccluded.starts)[views.location_rows].sum()) >= 1_000_000:
             sets = in_view_by_table(views, self._points_on_device, self.device)
         else:
             sets = landmarks_in_view(views)
@@ -156,7 +152,8 @@ class LocalizationMap:
 
 def shared_locations(cam_from_world: Float) -> tuple[Float, NDArray[np.int64]]:
     """Return the distinct locations (L, 3) m of poses (B, 3, 4), and each pose's row among these, (B,)."""
-    centers = np.round(camera_centers(cam_from_world), SAME_LOCATION_DECIMALS)
+    # centres that agree to a micrometre share one visibility test
+    centers = np.round(camera_centers(cam_from_world), 6)
     # views at a location mostly follow one another: compare the first of each run only
     first = np.ones(len(centers), dtype=bool)
     first[1:] = (centers[1:] != centers[:-1]).any(axis=1)

@@ -13,7 +13,6 @@ from torch import Tensor
 from wheretolook.inputs.channels import ATTRIBUTES
 
 BLOCK = 256  # views processed at a time: few enough for a processor's cache
-MIN_STD = 1e-6  # of attributes; a smaller one is replaced by 1
 
 
 @dataclass(frozen=True)
@@ -62,7 +61,7 @@ class FeatureStatistics:
             mean = float(known.mean()) if len(known) else 0.0
             std = float((known - mean).square().mean().sqrt()) if len(known) else 0.0
             means.append(mean)
-            stds.append(std if std > MIN_STD else 1.0)
+            stds.append(std if std > 1e-6 else 1.0)
         return cls(ATTRIBUTES, tuple(means), tuple(stds))
 
     @classmethod

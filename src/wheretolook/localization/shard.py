@@ -98,8 +98,8 @@ class SceneJob:
     store_matches: bool = False  # add `viewpoint_files.MATCH_FIELDS`
     cameras: tuple[tuple[int, Camera], ...] = ()  # by number, if viewpoints have a `camera_id`
     store_pixels: bool = False  # add `viewpoint_files.PIXEL_FIELD`, too
-    appearance: float = 0.0  # highest strength of `rendering.appearance`; add `viewpoint_files.APPEARANCE_FIELD`
-    changes: float = 0.0  # strength of the changes in `changed_mesh`; add `viewpoint_files.CHANGES_FIELD`
+    appearance: float = 0.0  # highest strength of `rendering.appearance`; add the column `APPEARANCE`
+    changes: float = 0.0  # strength of the changes in `changed_mesh`; add the column `CHANGES`
     changed_mesh: Path | None = None  # shown by the views of about half of the locations
 
 
@@ -196,8 +196,8 @@ def label_rows(
     pose) are added to `seconds`. A batch that exceeds a GPU's memory is halved. Returns the table with new status,
     error_m, error_deg and n_inliers, with `viewpoint_files.FIRST_FIELDS` by several hypotheses, `MATCH_FIELDS` and
     `PIXEL_FIELD` if the job stores them. With an `appearance` above 0 images are changed at strengths drawn up to it
-    (`rendering.appearance`), which `APPEARANCE_FIELD` holds. The changed mesh is shown by the views of locations drawn
-    by the localizer's seed, to which `CHANGES_FIELD` assigns the job's `changes`.
+    (`rendering.appearance`), which the column `APPEARANCE` holds. The changed mesh is shown by the views of locations drawn
+    by the localizer's seed, to which the column `CHANGES` assigns the job's `changes`.
     """
     true_poses = poses(table)
     seed = localizer.config.seed

@@ -36,25 +36,15 @@ if TYPE_CHECKING:
 REBUILD = "Copy or build the model again."
 # A point without its track. The track's elements follow: image id and index of the keypoint, uint32 each.
 POINT = np.dtype([("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("n", "<u8")])
-_FILES = ("cameras", "images", "points3D", "rigs", "frames")
 _UINT32 = Struct("<I")
 _UINT64 = Struct("<Q")
 _MAX_COORDINATE = 1e12  # of a point or a camera; its square is still finite in single precision
-_ROTATION_TOLERANCE = 0.01  # of the entries of R R^T: some tools write few decimals
-# Patterns in pycolmap's errors, and the file that they are about.
-_FILES_BY_ERROR = (
-    (r"Camera model|VerifyParams|cameras_|camera\.camera_id", "cameras"),
-    ("point2D.point3D_id|line_stream[12]|utf-8", "images"),
-    ("Image with ID|vector::|point3D.xyz", "points3D"),
-    ("rig_from_world|data_id|unordered_map", "frames"),
-    ("[Rr]ig|[Cc]amera|[Ss]ensor", "rigs"),
-    ("[Ff]rame", "frames"),
-)
 
 
 def check_binary(folder: Path) -> None:
     """Raise MapError if counts in a folder's binary model do not match the files' sizes, or a point is not finite."""
-    for name, record_length in _RECORD_LENGTHS.items():
+    lengths = {"images": _image_length, "points3D": _point_length, "frames": _frame_length}
+    for name, record_length in lengths.items():
         path = folder / f"{name}.bin"
         if path.is_file():  # models from before COLMAP 3.12 have no frames
             data = path.read_bytes()
@@ -90,7 +80,8 @@ def read_points(path: Path) -> tuple[NDArray[Any], NDArray[np.uint32]]:
 @contextmanager
 def without_marks(folder: Path, suffix: str) -> Iterator[Path]:
     """Yield a model's folder, or a copy of its texts without the byte-order marks that pycolmap cannot read."""
-    texts = [path for name in _FILES if (path := folder / (name + suffix)).is_file()] if suffix == ".txt" else []
+    names = ("cameras", "images", "points3D", "rigs", "frames") if suffix == ".txt" else ()
+    texts = [path for name in names if (path := folder / (name + suffix)).is_file()]
     if not any(map(_has_mark, texts)):
         yield folder
         return
@@ -150,7 +141,7 @@ def _is_pose(rigid: Any) -> bool:
     """Whether a `pycolmap.Rigid3d` is a rotation and a translation of usual size."""
     matrix = rigid.matrix()
     with np.errstate(over="ignore", invalid="ignore"):
-        is_rotation = np.abs(matrix[:, :3] @ matrix[:, :3].T - np.eye(3)).max() <= _ROTATION_TOLERANCE
+        is_rotation = np.abs(matrix[:, :3] @ matrix[:, :3].T - np.eye(3)).max() <= 0.01  # some tools write few decimals
     return bool(is_rotation and np.abs(matrix[:, 3]).max() <= _MAX_COORDINATE)
 
 
@@ -169,7 +160,15 @@ def _record_starts(data: bytes, record_length: Callable[[bytes, int], int], path
 
 def model_error(error: Exception, folder: Path, suffix: str) -> MapError:
     """Convert an error of pycolmap about a model's files to a MapError that names the file, where the error does."""
-    name = next((name for pattern, name in _FILES_BY_ERROR if re.search(pattern, str(error))), None)
+    files_by_error = (  # patterns in pycolmap's errors, and the file that they are about
+        (r"Camera model|VerifyParams|cameras_|camera\.camera_id", "cameras"),
+        ("point2D.point3D_id|line_stream[12]|utf-8", "images"),
+        ("Image with ID|vector::|point3D.xyz", "points3D"),
+        ("rig_from_world|data_id|unordered_map", "frames"),
+        ("[Rr]ig|[Cc]amera|[Ss]ensor", "rigs"),
+        ("[Ff]rame", "frames"),
+    )
+    name = next((name for pattern, name in files_by_error if re.search(pattern, str(error))), None)
     path = folder / f"{name}{suffix}" if name else folder
     return MapError(f"pycolmap cannot read the model: {error}", path=path, fix=REBUILD)
 
@@ -187,13 +186,9 @@ def _frame_length(data: bytes, start: int) -> int:
     return 68 + 16 * int(_UINT32.unpack_from(data, start + 64)[0])
 
 
-_RECORD_LENGTHS = {"images": _image_length, "points3D": _point_length, "frames": _frame_length}
-
-
+LANDMARKS_FILE = "landmarks.npz"  # in the folder of a map of this project
 CAMERAS_FILE = "cameras.npz"  # next to the landmarks; small enough to be shipped without the COLMAP model
 MODEL_FILES = ("cameras", "images", "points3D")
-_SUFFIXES = (".bin", ".txt")
-_LARGE_BYTES = 500e6  # of a model from which on reading it shows a progress bar
 
 
 @dataclass(frozen=True, eq=False)
@@ -217,7 +212,7 @@ class ModelArrays:
 def model_suffix(model_dir: str | Path) -> str:
     """Suffix of the model's files in a folder: ".bin" or ".txt". Raises MapError if the model is missing or incomplete."""
     folder = Path(model_dir)
-    suffix = next((s for s in _SUFFIXES if any((folder / (n + s)).is_file() for n in MODEL_FILES)), None)
+    suffix = next((s for s in (".bin", ".txt") if any((folder / (n + s)).is_file() for n in MODEL_FILES)), None)
     if suffix is None:
         inside = [str(path.parent) for path in sorted(folder.glob("**/images.*")) if holds_model(path.parent)][:5]
         examples = f", such as {', '.join(inside)}" if inside else ""
@@ -240,7 +235,7 @@ def read_model(model_dir: str | Path) -> Any:
     import pycolmap
 
     n_bytes = sum((folder / (name + suffix)).stat().st_size for name in MODEL_FILES)
-    bar = tqdm(total=2, desc=f"model of {n_bytes / 1e9:.1f} GB: read", unit="step", disable=n_bytes < _LARGE_BYTES)
+    bar = tqdm(total=2, desc=f"model of {n_bytes / 1e9:.1f} GB: read", unit="step", disable=n_bytes < 500e6)
     model = pycolmap.Reconstruction()
     with bar, quiet_colmap():
         if suffix == ".bin":
@@ -393,7 +388,7 @@ def describe_cameras(reconstruction: Any) -> list[dict[str, Any]]:
 
 def holds_model(folder: Path) -> bool:
     """Whether a folder holds a COLMAP model, binary or text."""
-    return any(all((folder / (name + suffix)).is_file() for name in MODEL_FILES) for suffix in _SUFFIXES)
+    return any(all((folder / (name + suffix)).is_file() for name in MODEL_FILES) for suffix in (".bin", ".txt"))
 
 
 def save_mapping_poses(cam_from_world: Float, path: str | Path) -> None:

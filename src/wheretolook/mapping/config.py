@@ -11,37 +11,40 @@ from wheretolook.features.extractor import ExtractorConfig
 from wheretolook.geometry.camera import CameraConfig
 from wheretolook.utils.errors import ConfigError, check_positive, check_range, no_option, reject
 
-# The walk of a person with a camera through a scene.
-COVERAGE = 0.7  # share of the reachable floor that is visited; the walk ends there
-IMAGE_SPACING_M = 0.6  # largest distance along the walk between two images; farther apart they overlap too little
-EYE_HEIGHT_M = 1.45  # mean height of the camera above the floor
-SWING_DEG = 40.0  # how far the camera swings to either side of the walk
-PITCH_DEG = -5.0  # mean pitch, negative is down
-VISIT_RADIUS_M = 1.0  # floor within this walking distance counts as visited; it grows until images are close enough
-EYE_HEIGHT_VARIATION_M = 0.2  # largest deviation of a hand-held camera's height
-CELL_M = 0.3  # grid spacing of the walk, well below a door's width
-MAX_STEP_HEIGHT_M = 0.4  # largest difference in floor height between neighbouring cells: two steps of stairs
-SWING_PERIOD = 12.0  # images in one swing from left to right and back, so that neighbours overlap
-PITCH_VARIATION_DEG = 10.0  # largest deviation of a hand-held camera's pitch
-_WALK_RECORD = {
-    "coverage": COVERAGE,
-    "image_spacing_m": IMAGE_SPACING_M,
-    "eye_height_m": EYE_HEIGHT_M,
-    "swing_deg": SWING_DEG,
-    "pitch_deg": PITCH_DEG,
-    "visit_radius_m": VISIT_RADIUS_M,
-    "eye_height_variation_m": EYE_HEIGHT_VARIATION_M,
-    "cell_m": CELL_M,
-    "max_step_height_m": MAX_STEP_HEIGHT_M,
-    "swing_period": SWING_PERIOD,
-    "pitch_variation_deg": PITCH_VARIATION_DEG,
-}
 
-MIN_VARIED_IMAGES = 8
-# What `vary` draws from the scene's seed: coverage and unevenness of the walk, and a share of the images.
-COVERAGES = 0.15, 0.8
-UNEVENNESS = 0.0, 2.0
-SHARES_OF_IMAGES = 0.08, 1.0  # uniform in the logarithm
+@dataclass(frozen=True)
+class WalkStyle:
+    """The walk of a person with a hand-held camera through a scene, part of the keys of finished maps.
+
+    Attributes:
+        coverage: share of the reachable floor that is visited; the walk ends there.
+        image_spacing_m: largest distance along the walk between two images; farther apart they overlap too little.
+        eye_height_m: mean height of the camera above the floor.
+        swing_deg: how far the camera swings to either side of the walk.
+        pitch_deg: mean pitch, negative is down.
+        visit_radius_m: floor within this walking distance counts as visited; it grows until images are close enough.
+        eye_height_variation_m: largest deviation of the camera's height.
+        cell_m: grid spacing of the walk, well below a door's width.
+        max_step_height_m: largest difference in floor height between neighbouring cells: two steps of stairs.
+        swing_period: images in one swing from left to right and back, so that neighbours overlap.
+        pitch_variation_deg: largest deviation of the camera's pitch.
+    """
+
+    coverage: float = 0.7
+    image_spacing_m: float = 0.6
+    eye_height_m: float = 1.45
+    swing_deg: float = 40.0
+    pitch_deg: float = -5.0
+    visit_radius_m: float = 1.0
+    eye_height_variation_m: float = 0.2
+    cell_m: float = 0.3
+    max_step_height_m: float = 0.4
+    swing_period: float = 12.0
+    pitch_variation_deg: float = 10.0
+
+
+WALK = WalkStyle()
+
 
 PARTNERS = 10  # images that each image is matched with; time grows with their number
 MAX_EPIPOLAR_ERROR_PX = 2.0  # matches farther from the epipolar line are dropped; keypoints are accurate to a pixel
@@ -327,7 +330,7 @@ class MapConfig:
                 del settings[name]
         return {
             **settings,
-            "walk": _WALK_RECORD,
+            "walk": asdict(WALK),
             "extractor": self.extractor.record(),
             "partners": PARTNERS,
             "max_epipolar_error_px": MAX_EPIPOLAR_ERROR_PX,

@@ -18,8 +18,6 @@ from wheretolook.mapping.colmap_model import read_model
 from wheretolook.utils.errors import SceneError, check_positive
 from wheretolook.utils.files import load_npy, read_image
 
-MAX_MEASURED = 50  # images that the scale is measured in
-
 
 def read_depth(path: Path, scale: float = 1000.0) -> NDArray[np.float32]:
     """Read a depth image (H, W) in metres, 0 without a reading: PNG or TIFF (integers of `scale` a metre, or floats in
@@ -47,10 +45,10 @@ def read_depth_images(model: Path, folder: Path, scale: float = 1000.0) -> list[
     """
     reconstruction = read_model(model)
     cameras = cameras_by_id(reconstruction.cameras, model)
-    rectify = cache(lambda camera_id, size: _rectified(cameras[camera_id], *size))
+    rectify = cache(_rectified)
     images = []
     for image, depth_m in _depth_of_images(reconstruction, folder, scale):
-        camera, shown = rectify(image.camera_id, depth_m.shape[::-1])
+        camera, shown = rectify(cameras[image.camera_id], depth_m.shape[::-1])
         if shown is not None:
             depth_m = np.append(depth_m, np.float32(0))[shown]
         images.append(DepthImage(depth_m, camera, image.cam_from_world().matrix()))
@@ -63,11 +61,11 @@ def read_depth_images(model: Path, folder: Path, scale: float = 1000.0) -> list[
 def metres_per_unit(model: Path, folder: Path, scale: float = 1000.0) -> float | None:
     """Return the metres in a unit of a COLMAP model by its depth images; arguments are those of `read_depth_images`.
 
-    It is the median ratio of the depth at keypoints to that of their landmarks, of up to `MAX_MEASURED` images; None
+    It is the median ratio of the depth at keypoints to that of their landmarks, of up to 50 images; None
     if no keypoint of a landmark has a depth.
     """
     reconstruction = read_model(model)
-    step = -(-reconstruction.num_images() // MAX_MEASURED)
+    step = -(-reconstruction.num_images() // 50)
     ratios = []
     for image, depth_m in _depth_of_images(reconstruction, folder, scale, step):
         observed = image.get_observation_points2D()
@@ -103,11 +101,12 @@ def _depth_of_images(
             yield image, depth_m
 
 
-def _rectified(camera: Camera, width: int, height: int) -> tuple[PinholeCamera, NDArray[np.int64] | None]:
-    """Return the pinhole of a camera's rectified images of another size, and which pixel of an image each pixel shows.
+def _rectified(camera: Camera, shape: tuple[int, ...]) -> tuple[PinholeCamera, NDArray[np.int64] | None]:
+    """Return the pinhole of a camera's rectified images of another width and height, and the pixel that each one shows.
 
     These are (height, width) rows of the flat image, width * height outside of it; None for a camera without distortion.
     """
+    width, height = shape
     is_pinhole = isinstance(camera, PinholeCamera) or camera.model in ("SIMPLE_PINHOLE", "PINHOLE")
     fx = fy = camera.mean_focal_px
     if is_pinhole:

@@ -21,11 +21,7 @@ from wheretolook.utils.files import check_file, max_expanded_bytes
 DATABASE_FILE = "database.db"  # COLMAP's usual name
 HDF5_SUFFIXES = (".h5", ".hdf5")
 _KIND_TABLE = "wheretolook_features"  # of a database: the name of the kind of its descriptors
-_TABLES = ("images", "keypoints", "descriptors", _KIND_TABLE)
-_MAX_VALUE = np.float32(1e15)  # no pixel and no number of a descriptor comes near
-_TOLERANCE_PX = 0.01  # between keypoints of a file and of the model that was built from it
 _FIX = "Give the file of features that the model was built from, or none."
-_SAMPLE = 3  # images that show what a file of features is
 
 
 class _Features(NamedTuple):
@@ -85,7 +81,7 @@ def features_kind(features: Path, reconstruction: Any) -> DescriptorKind | None:
 
     Raises MapError if the file is missing, unreadable, or not the one the model was built from, or h5py is missing.
     """
-    images = [image for _, image in sorted(reconstruction.images.items()) if image.num_points3D][:_SAMPLE]
+    images = [image for _, image in sorted(reconstruction.images.items()) if image.num_points3D][:3]
     kind = None
     for image, found in zip(images, _read_images(features, [image.name for image in images]), strict=True):
         _check_keypoints(found, image, features)
@@ -142,7 +138,7 @@ def _check_keypoints(features: _Features, image: Any, path: Path) -> None:
         raise MapError(problem, path=path, value=(len(pixels), n), fix=_FIX)
     if n:
         ends = pixels[[0, -1]]
-        tolerance_px = np.full(ends.shape, _TOLERANCE_PX)
+        tolerance_px = np.full(ends.shape, 0.01)
         if path.suffix.lower() in HDF5_SUFFIXES:
             # hloc keeps them in half precision, and adds half a pixel in it: half a unit in the last place more.
             tolerance_px += np.spacing(np.clip(np.abs(ends), 0, 2.0**15).astype(np.float16)).astype(np.float64) / 2
@@ -215,7 +211,7 @@ def _kind_in_table(database: sqlite3.Connection) -> DescriptorKind | None:
     """
     named = None
     for schema, name, table_type, *_ in database.execute("PRAGMA table_list").fetchall():
-        if schema == "main" and str(name).lower() in _TABLES:
+        if schema == "main" and str(name).lower() in ("images", "keypoints", "descriptors", _KIND_TABLE):
             columns = database.execute(f'PRAGMA table_xinfo("{name}")').fetchall()
             if table_type != "table" or any(column["hidden"] for column in columns):
                 raise ValueError(f"{name} is not a plain table")
@@ -295,6 +291,7 @@ def _array(dataset: Any, name: str) -> NDArray[Any]:
 
 def _checked(values: NDArray[Any], name: str) -> NDArray[Any]:
     """Numbers (K, N) of an image. Raises ValueError if they are not finite, or far larger than any extractor's."""
-    if values.ndim != 2 or values.dtype.kind not in "fiu" or not (np.abs(values) < _MAX_VALUE).all():
+    # no pixel and no number of a descriptor comes near
+    if values.ndim != 2 or values.dtype.kind not in "fiu" or not (np.abs(values) < np.float32(1e15)).all():
         raise ValueError(f"the keypoints or descriptors of {name} are not finite numbers")
     return values

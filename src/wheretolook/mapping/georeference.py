@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from functools import lru_cache
 from io import StringIO
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -22,21 +22,8 @@ from wheretolook.utils.errors import ConfigError, MapError
 from wheretolook.utils.files import read_json_object, read_text
 from wheretolook.utils.texts import LOG
 
-if TYPE_CHECKING:
-    import pycolmap
-
-
-_MIN_ANGLE_DEG = 1.5  # between two rays to a marker, as for landmarks
-_SOFT_PX = 1.0  # larger residuals count less than quadratically
-_ROUNDS = 3  # of fitting lines to the edges between the corners
-_SAMPLES = 32  # profiles across an edge
-_AWAY_FROM_CORNERS = 0.15  # share of an edge that is skipped at either end, where its neighbours blur into it
-_STEPS_PER_PX = 4  # samples of a profile
-
 # A marker is rejected if the root mean square reprojection error of its corners exceeds both this many pixels and this
 # share of the photographs' longer side. That of a marker that was moved, or printed twice, is tens of pixels.
-MAX_ERROR_PX = 4.0
-MAX_ERROR_SHARE = 1 / 400
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +31,7 @@ class MarkerView:
     """A view of a marker in a photograph with a known pose."""
 
     image: str  # the photograph's name
-    camera: pycolmap.Camera
+    camera: Any  # `pycolmap.Camera`
     cam_from_world: Float  # (3, 4)
     corners_px: Float  # (4, 2), clockwise from the marker's top left; (0.5, 0.5) is the centre of the top-left pixel
 
@@ -107,16 +94,16 @@ def place_marker(marker_id: int, views: Sequence[MarkerView]) -> Marker:
     rays = start.mean(0) - centers
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     angle_deg = np.degrees(np.arccos(np.clip((rays @ rays.T).min(), -1, 1)))
-    if not angle_deg >= _MIN_ANGLE_DEG:
+    if not angle_deg >= 1.5:  # as for landmarks
         problem = f"marker {marker_id} is in photographs from one direction only, {angle_deg:.1f} degrees apart at most"
         raise MapError(problem, value=" ".join(images), fix="Take another photograph of it from another place.")
 
     def residuals(values: Float) -> Float:
         return np.concatenate([_reprojection(view, values.reshape(4, 3)).ravel() for view in views])
 
-    found = least_squares(residuals, start.ravel(), loss="soft_l1", f_scale=_SOFT_PX, x_scale="jac")
+    found = least_squares(residuals, start.ravel(), loss="soft_l1", f_scale=1.0, x_scale="jac")
     error_px = float(np.sqrt(2 * np.mean(residuals(found.x) ** 2)))
-    limit_px = max(MAX_ERROR_PX, MAX_ERROR_SHARE * max(max(view.camera.width, view.camera.height) for view in views))
+    limit_px = max(4.0, 1 / 400 * max(max(view.camera.width, view.camera.height) for view in views))
     if not error_px <= limit_px:
         problem = (
             f"no position of marker {marker_id} fits: its corners are off by {error_px:.1f} px, over {limit_px:.1f}"
@@ -170,7 +157,7 @@ def refine_corners(grey: NDArray[np.uint8], corners: Float) -> Float:
     not move an edge.
     """
     at = np.asarray(corners, dtype=np.float64)
-    for _ in range(_ROUNDS):
+    for _ in range(3):
         lines = [_edge_line(grey, at[side], at[(side + 1) % 4], at.mean(0)) for side in range(4)]
         if any(line is None for line in lines):
             return corners
@@ -199,15 +186,16 @@ def _edge_line(grey: NDArray[np.uint8], start: Float, end: Float, inside: Float)
     if normal @ (inside - start) > 0:
         normal = -normal
     half = float(np.clip(length / 16, 1.5, 6.0))  # within the black frame, a sixth to a tenth of the marker
-    across = np.linspace(-half, half, 2 * round(half * _STEPS_PER_PX) + 1)
-    share = np.linspace(_AWAY_FROM_CORNERS, 1 - _AWAY_FROM_CORNERS, _SAMPLES)
+    across = np.linspace(-half, half, 2 * round(half * 4) + 1)
+    n_profiles = 32
+    share = np.linspace(0.15, 1 - 0.15, n_profiles)  # where neighbouring edges blur into it
     middle = start + share[:, None] * along
     at = (middle[:, None] + across[:, None] * normal).astype(np.float32)
     profile = cv2.remap(grey.astype(np.float32), at[..., 0], at[..., 1], cv2.INTER_LINEAR, None, cv2.BORDER_REPLICATE)
     rise = np.maximum(np.diff(profile, axis=1), 0)
     total = rise.sum(1)
     strong = total > max(10.0, 0.5 * float(np.median(total)))
-    if strong.sum() < _SAMPLES // 2:
+    if strong.sum() < n_profiles // 2:
         return None
     offset = (rise[strong] @ ((across[1:] + across[:-1]) / 2)) / total[strong]
     typical = np.abs(offset - np.median(offset))
@@ -222,7 +210,6 @@ REPORT_FILE = "report.json"
 DEPTH_M = 5.0
 """Median depth of the images that a map of unknown scale is scaled to: scorers were trained in rooms."""
 MAX_WRONG_SHARE = 0.05  # of given positions that are left out
-_FLAT = 1e-6  # points whose second largest spread is below this share of the largest are on a line
 
 
 @dataclass(frozen=True)
@@ -324,7 +311,8 @@ def fit_similarity(source: ArrayLike, target: ArrayLike) -> Similarity:
 
     a = np.asarray(source, dtype=np.float64)
     b = np.asarray(target, dtype=np.float64)
-    ranks = [np.linalg.matrix_rank(points - points.mean(0), rtol=_FLAT) if len(points) else 0 for points in (a, b)]
+    # of the largest spread
+    ranks = [np.linalg.matrix_rank(points - points.mean(0), rtol=1e-6) if len(points) else 0 for points in (a, b)]
     sim3d = pycolmap.estimate_sim3d(a, b) if len(a) >= 3 and min(ranks) >= 2 else None
     if sim3d is None:
         fix = "Give the positions of three photographs or more, not on a line."

@@ -7,7 +7,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pycolmap
 from numpy.typing import NDArray
+from PIL import Image
 
 from wheretolook.geometry.poses import camera_centers
 from wheretolook.mapping.colmap_model import (
@@ -26,13 +28,6 @@ from wheretolook.mapping.photograph_map import PhotographFeatures, photograph_fe
 from wheretolook.mapping.triangulation import choose_pairs, triangulate_model
 from wheretolook.utils.errors import ConfigError, MapError
 from wheretolook.utils.files import image_size, path_within
-
-_EITHER = "Leave --database out to triangulate again, or --images to keep the model's landmarks."
-_FIX = "Raise `ImportConfig.max_reprojection_error_px`, or check the model's poses and intrinsics."
-_PROPORTION_TOLERANCE = 0.01  # between the proportions of a photograph and of its camera
-_EXIF_ORIENTATION = 274
-_SIDEWAYS = (5, 6, 7, 8)  # values of EXIF's orientation for photographs that are stored on a side
-_FACING_DEG = 60.0  # without points, cameras whose axes differ by more are not matched
 
 
 @dataclass(frozen=True)
@@ -67,7 +62,8 @@ def map_existing(
     """
     images = config.images
     if images is not None and config.database is not None:
-        raise ConfigError("images give new keypoints, which a database does not describe", fix=_EITHER)
+        fix = "Leave --database out to triangulate again, or --images to keep the model's landmarks."
+        raise ConfigError("images give new keypoints, which a database does not describe", fix=fix)
     check_tables(config.scale, config.frame)
     with replacing_map(config, out_dir, seed, workers, device, progress) as (folder, run):
         with run.clock("read"):
@@ -88,7 +84,8 @@ def map_existing(
             frame.world_from_map.transform_model(model)
         if config.limit_px and not all(point.has_error() for point in model.points3D.values()):
             model.update_point_3d_errors()
-        draft = MapDraft(model, config.model, config.limit_px, _FIX, database, search_device=device)
+        fix = "Raise `ImportConfig.max_reprojection_error_px`, or check the model's poses and intrinsics."
+        draft = MapDraft(model, config.model, config.limit_px, fix, database, search_device=device)
         landmarks, fields = finish_map(draft, folder, run)
         poses = colmap_poses(config.model, model)
         report = ExistingMapReport(
@@ -120,8 +117,6 @@ def _triangulate(source: Any, images: Path, features: PhotographFeatures, databa
 
 def _posed_model(source: Any, features: PhotographFeatures) -> Any:
     """A reconstruction with the same cameras, names and poses, at the size of the features; image i has the id i + 1."""
-    import pycolmap
-
     model = pycolmap.Reconstruction()
     sizes = dict[int, list[int]]()
     images = [source.images[number] for number in registered_names(source)]
@@ -156,7 +151,7 @@ def _pairs(source: Any) -> NDArray[np.int64]:
         return choose_pairs(shared, PARTNERS, 1.0)
     centers = camera_centers(poses)
     distance = np.linalg.norm(centers[:, None] - centers, axis=-1)
-    nearness = 1 / (1 + distance) * (poses[:, 2, :3] @ poses[:, 2, :3].T > np.cos(np.radians(_FACING_DEG)))
+    nearness = 1 / (1 + distance) * (poses[:, 2, :3] @ poses[:, 2, :3].T > np.cos(np.radians(60)))
     np.fill_diagonal(nearness, 0)
     return choose_pairs(nearness, 2 * PARTNERS, 0.0)
 
@@ -174,7 +169,7 @@ def _are_turned(model: Any, folder: Path) -> bool:
         for (number, name), (width, height, sideways) in zip(names.items(), stored, strict=True):
             size = (height, width) if turned and sideways else (width, height)
             camera = model.cameras[model.images[number].camera_id]
-            if abs(size[0] * camera.height / (size[1] * camera.width) - 1) > _PROPORTION_TOLERANCE:
+            if abs(size[0] * camera.height / (size[1] * camera.width) - 1) > 0.01:
                 misfits[turned] = name, size, (camera.width, camera.height)
                 break
         else:
@@ -186,12 +181,11 @@ def _are_turned(model: Any, folder: Path) -> bool:
 
 def _size(path: Path) -> tuple[int, int, bool]:
     """Width and height of a photograph as stored, and whether its EXIF orientation swaps them."""
-    from PIL import Image
-
     try:
         width, height = image_size(path)
         with Image.open(path) as photograph:
-            return width, height, photograph.getexif().get(_EXIF_ORIENTATION, 1) in _SIDEWAYS
+            # Orientation; 5 to 8 are stored on a side
+            return width, height, photograph.getexif().get(0x0112, 1) in (5, 6, 7, 8)
     except (OSError, ValueError) as error:
         fix = "Give the folder that the names of the model's images are relative to."
         raise MapError(f"cannot read an image of the model: {error}", path=path, fix=fix) from error

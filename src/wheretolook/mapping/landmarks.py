@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
@@ -19,10 +19,6 @@ from wheretolook.mapping.feature_files import read_descriptors
 from wheretolook.utils.errors import MapError, MapWarning
 from wheretolook.utils.files import load_npz, save_npz
 
-if TYPE_CHECKING:
-    import pycolmap
-
-
 MAP_ATTRIBUTES = (
     "track_length",  # logarithm of the number of observations
     "reprojection_error",  # mean error in pixels
@@ -34,11 +30,6 @@ MAP_ATTRIBUTES = (
     "mapped_pixel_size",  # logarithm of the mean mapping distance over the mapping cameras' focal length in pixels
 )
 """Attributes of a landmark that scorers use; NaN where a value is unknown."""
-
-
-_BLOCK = 4096  # landmarks whose tracks are gathered at a time
-_PROGRESS_AFTER_S = 2.0
-_TILE = 512  # descriptors along a side of a product that fits into the cache
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,7 +131,7 @@ def load_colmap_landmarks(
     database: str | Path | None = None,
     max_reprojection_error_px: float | None = None,
     device: str = "cpu",
-    reconstruction: pycolmap.Reconstruction | None = None,
+    reconstruction: Any = None,
     progress: bool = True,
     arrays: ModelArrays | None = None,
     ambiguity: bool = True,
@@ -220,12 +211,13 @@ def max_cosine_to_other(descriptors: NDArray[Any], device: str = "cpu", progress
     lengths = torch.as_tensor(np.linalg.norm(descriptors.astype(np.float64), axis=1), device=device)
     inverse = 1 / torch.where(lengths > 0, lengths, 1).float()
     best = torch.full((n,), -torch.inf, device=device)
-    tiles = tqdm(range(0, n, _TILE), "landmarks: ambiguity", delay=_PROGRESS_AFTER_S, unit="tile", disable=not progress)
+    tile = 512  # along a side of a product that fits into the cache
+    tiles = tqdm(range(0, n, tile), "landmarks: ambiguity", delay=2.0, unit="tile", disable=not progress)
     with one_thread():  # products are small: several threads would mostly wait for one another
         for i in tiles:
-            for j in range(i, n, _TILE):  # each pair of tiles once: its product serves rows and columns
-                rows = slice(i, i + _TILE)
-                columns = slice(j, j + _TILE)
+            for j in range(i, n, tile):  # each pair of tiles once: its product serves rows and columns
+                rows = slice(i, i + tile)
+                columns = slice(j, j + tile)
                 cosine = values[rows] @ values[columns].T
                 cosine *= inverse[rows, None] * inverse[columns]
                 if i == j:
@@ -272,8 +264,9 @@ def _mean_descriptors(model: ModelArrays, observations: NDArray[Any], kind: Desc
     """Mean descriptor (P, D) of each point's observations (O, D), of unit length, as its kind is stored."""
     start = model.observation_start
     mean = np.empty((len(start) - 1, observations.shape[1]), dtype=observations.dtype)
-    for first in range(0, len(mean), _BLOCK):
-        ends = start[first : first + _BLOCK + 1]
+    block = 4096  # landmarks whose tracks are gathered at a time
+    for first in range(0, len(mean), block):
+        ends = start[first : first + block + 1]
         track = unit_descriptors(observations[ends[0] : ends[-1]])
-        mean[first : first + _BLOCK] = kind.store(unit_descriptors(np.add.reduceat(track, ends[:-1] - ends[0])))
+        mean[first : first + block] = kind.store(unit_descriptors(np.add.reduceat(track, ends[:-1] - ends[0])))
     return mean

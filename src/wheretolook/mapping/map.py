@@ -15,6 +15,7 @@ from wheretolook.features.extractor import SIFT, DescriptorKind
 from wheretolook.geometry.camera import Camera, cameras_by_id
 from wheretolook.geometry.poses import Float
 from wheretolook.mapping.colmap_model import (
+    LANDMARKS_FILE,
     ModelArrays,
     compact_poses,
     find_camera,
@@ -32,8 +33,6 @@ from wheretolook.mapping.map_frame import IDENTITY, MapFrame, find_frame, has_ph
 from wheretolook.utils.errors import ConfigError, MapError, MapWarning
 from wheretolook.utils.files import path_within, read_json_object
 from wheretolook.utils.texts import LOG
-
-_LEVELS = 4  # folders above a model that are searched: hloc's models are in outputs/sfm/models/0
 
 
 def find_features(model_dir: Path, reconstruction: Any = None) -> Path | None:
@@ -101,7 +100,7 @@ def has_image(folder: Path, name: str) -> bool:
 
 def _above(model_dir: Path) -> list[Path]:
     """The folders above a model, the nearest first."""
-    return [*model_dir.absolute().parents[:_LEVELS]]
+    return [*model_dir.absolute().parents[:4]]  # hloc's models are in outputs/sfm/models/0
 
 
 def _kind_or_problem(path: Path, reconstruction: Any) -> tuple[DescriptorKind | None, str]:
@@ -189,10 +188,43 @@ class Map:
         arrays = found.of_arrays(arrays)
         landmarks = load_colmap_landmarks(path, database, max_reprojection_error_px, device, model, arrays=arrays)
         found.warn(path, landmarks.mapping_distance_m, arrays.image_poses)
+        return cls._of_model(path, model, arrays, landmarks, found)
+
+    @classmethod
+    def open_described(
+        cls, path: Path, database: Path | None = None, frame: FrameOptions = FrameOptions(), device: str = "cpu"
+    ) -> Map:
+        """Open a COLMAP model with the descriptors of its landmarks, to localize; without warnings and ambiguity.
+
+        Descriptors are those in the file of landmarks of a map of this project, unless a database is given; otherwise
+        those of the given features, or of any next to the model (`find_features`). Raises MapError as `open`, and if
+        there are none.
+        """
+        model = read_model(path)
+        arrays = model_arrays(model)
+        found = find_frame(path, model, frame, arrays=arrays)
+        arrays = found.of_arrays(arrays)
+        stored = path / LANDMARKS_FILE
+        kept = Landmarks.load(stored) if database is None and stored.is_file() else None
+        is_described = kept is not None and kept.descriptors is not None
+        features = None if is_described else database or find_features(path, model)
+        landmarks = load_colmap_landmarks(path, features, None, device, model, arrays=arrays, ambiguity=False)
+        if kept is not None and is_described:
+            if not np.array_equal(kept.ids, landmarks.ids):
+                problem = "the file has other landmarks than the model"
+                raise MapError(problem, path=stored, fix="Give --database, or run the map stage again.")
+            landmarks = replace(landmarks, descriptors=kept.descriptors, described_by=kept.described_by)
+        if landmarks.descriptors is None:
+            fix = "Give --database: the model's database.db, or hloc's feats-*.h5."
+            raise MapError("the landmarks have no descriptors, so nothing can be localized", path=path, fix=fix)
+        return cls._of_model(path, model, arrays, landmarks, found)
+
+    @classmethod
+    def _of_model(cls, path: Path, model: Any, arrays: ModelArrays, landmarks: Landmarks, frame: MapFrame) -> Map:
         return cls(
             landmarks=landmarks,
             mapping_poses=compact_poses(arrays.image_poses),
-            frame=found,
+            frame=frame,
             has_photographs=has_photographs(path),
             path=path,
             cameras=cameras_by_id(model.cameras, path),

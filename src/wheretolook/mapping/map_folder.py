@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from wheretolook.mapping.colmap_model import CAMERAS_FILE, colmap_poses, save_mapping_poses, write_model
+from wheretolook.mapping.colmap_model import CAMERAS_FILE, LANDMARKS_FILE, colmap_poses, save_mapping_poses, write_model
 from wheretolook.mapping.config import MapConfig, SourceImages
 from wheretolook.mapping.feature_files import DATABASE_FILE, HDF5_SUFFIXES
 from wheretolook.mapping.georeference import REPORT_FILE
@@ -22,7 +22,6 @@ from wheretolook.utils.errors import MapError
 from wheretolook.utils.files import atomic_folder, copy_file, write_text
 from wheretolook.utils.processes import WorkerPool
 
-LANDMARKS_FILE = "landmarks.npz"
 IMAGES_FOLDER = "images"
 
 

@@ -1,4 +1,4 @@
-"""Plausibility checks of maps of unknown origin: metres, z up, and the frame of a mesh."""
+"""The frame of a map: scale, direction up as its cameras were held, and checks that both are plausible."""
 
 from __future__ import annotations
 
@@ -25,7 +25,6 @@ from wheretolook.mapping.georeference import (
     scale_from_depths,
     scale_from_positions,
 )
-from wheretolook.mapping.gravity import Gravity, estimate_gravity, rotation_to_z
 from wheretolook.utils.errors import ConfigError, MapError, MapWarning
 from wheretolook.utils.files import read_json_object
 
@@ -33,16 +32,77 @@ if TYPE_CHECKING:
     from wheretolook.rendering.raycasting import MeshRaycaster
 
 
-DISTANCE_M = (0.2, 50.0)
-"""Plausible range of the median distance from mapping cameras to landmarks, from tabletops to plazas."""
-SPACING_M = 5.0
-"""Largest plausible median distance from a mapping camera to the nearest other one."""
-TILT_DEG = {"level": 25.0, "mean": 50.0}
-"""Largest plausible angle between z and the estimated up, by `Gravity.method`: people roll a camera by a few degrees,
-but may tilt all their photographs of an object the same way."""
+_MIN_RESIDUAL = np.sin(np.radians(0.5))  # limits the weights
+
+
+@dataclass(frozen=True, eq=False)
+class Gravity:
+    """The direction up, and how well the photographs agree on it."""
+
+    up: Float  # (3,) unit vector in the frame of the poses
+    # "level": the direction most nearly perpendicular to the images' x axes. "mean": the cameras rotated too little for
+    # that, so it is the mean of the images' own up directions. "given": the direction in the camera was given.
+    method: Literal["level", "mean", "given"]
+    residual_deg: Float  # (M,) roll of each photograph for "level", else the angle between its own up and `up`
+
+    @property
+    def rotation(self) -> Float:
+        """The smallest rotation (3, 3) from `up` to z."""
+        return rotation_to_z(self.up)
+
+
+def estimate_gravity(cam_from_world: ArrayLike, up_in_camera: tuple[float, float, float] | None = None) -> Gravity:
+    """Estimate the direction up from poses (M, 3, 4), or from up in the camera frame if that is known.
+
+    People tilt a camera up and down but hardly roll it, so the images' x axes are level: up is the direction d with the
+    least sum of |x . d|, which a minority of rolled photographs does not move. Iteratively reweighted least squares.
+    """
+    rotation = np.asarray(cam_from_world, dtype=np.float64)[:, :, :3]
+    direction = np.array([0.0, -1.0, 0.0]) if up_in_camera is None else np.asarray(up_in_camera, dtype=np.float64)
+    ups = np.einsum("mji,j->mi", rotation, direction / np.linalg.norm(direction))
+    mean = _median_direction(ups)
+    if up_in_camera is None:
+        level = _level_direction(rotation[:, 0])
+        if level is not None:
+            up = level if level @ mean > 0 else -level
+            return Gravity(up, "level", np.degrees(np.arcsin(np.clip(np.abs(rotation[:, 0] @ up), 0, 1))))
+    residual_deg = np.degrees(np.arccos(np.clip(ups @ mean, -1, 1)))
+    return Gravity(mean, "mean" if up_in_camera is None else "given", residual_deg)
+
+
+def rotation_to_z(up: ArrayLike) -> Float:
+    """The smallest rotation (3, 3) from a direction (3,) to z; about x if it points straight down."""
+    a = np.asarray(up, dtype=np.float64)
+    x, y, z = a / np.linalg.norm(a)
+    if z < -1 + 1e-12:
+        return np.diag([1.0, -1.0, -1.0])
+    skew = np.array([[0.0, 0.0, -x], [0.0, 0.0, -y], [x, y, 0.0]])
+    return np.asarray(np.eye(3) + skew + skew @ skew / (1 + z))
+
+
+def _level_direction(axes: Float) -> Float | None:
+    """The direction most nearly perpendicular to unit axes (M, 3); None if they do not determine it."""
+    weights = np.ones(len(axes))
+    for _ in range(50):
+        values, vectors = np.linalg.eigh((axes.T * weights) @ axes / weights.sum())
+        weights = 1 / np.maximum(np.abs(axes @ vectors[:, 0]), _MIN_RESIDUAL)
+    least, middle = np.sqrt(np.maximum(values[:2], 0))
+    # of the x axes within the level plane
+    return vectors[:, 0] if middle > np.sin(np.radians(5)) and middle > 3 * least else None
+
+
+def _median_direction(directions: Float) -> Float:
+    """The unit vector with nearly the least sum of angles to unit vectors (M, 3): Weiszfeld's iteration on a sphere."""
+    at: Float = directions.mean(0)
+    for _ in range(50):
+        at = at / max(float(np.linalg.norm(at)), 1e-12)
+        weights = 1 / np.maximum(np.linalg.norm(directions - at, axis=1), _MIN_RESIDUAL)
+        at = (directions * weights[:, None]).sum(0) / weights.sum()
+    return at / max(float(np.linalg.norm(at)), 1e-12)
+
+
 MESH_DISTANCE_M = (0.3, 100.0)
 """Largest plausible median distance of landmarks to a mesh, and the farthest distance that is measured."""
-_MAX_MEASURED = 10_000  # landmarks whose distance to a mesh is measured: enough for a median
 LOOKING_DOWN = 0.7  # mean of the cameras' axes along -z above which their roll does not determine up
 
 
@@ -55,7 +115,7 @@ def warn_of_mesh(mesh: str | Path, points: ArrayLike, raycaster: MeshRaycaster) 
 def mesh_warning(points: ArrayLike, raycaster: MeshRaycaster) -> str:
     """Message if a mesh seems not to be in a map's frame and unit, because landmarks (N, 3) m are far from it; else ""."""
     at = np.asarray(points, dtype=np.float64)
-    at = at[:: max(1, -(-len(at) // _MAX_MEASURED))]
+    at = at[:: max(1, -(-len(at) // 10_000))]  # points are enough for a median
     off_m = float(np.median(raycaster.distance_to_surface(at, MESH_DISTANCE_M[1])))
     if not off_m > MESH_DISTANCE_M[0]:
         return ""
@@ -77,11 +137,12 @@ def scale_warning(mapping_distance_m: ArrayLike, centers: ArrayLike) -> str:
     distance = float(np.median(np.asarray(mapping_distance_m)))
     at = np.asarray(centers, dtype=np.float64)
     spacing = float(np.median(cKDTree(at).query(at, 2)[0][:, 1])) if len(at) > 1 else 0.0
-    low, high = DISTANCE_M
-    if low <= distance <= high and spacing <= SPACING_M:
+    max_spacing_m = 5.0
+    low, high = 0.2, 50.0  # from tabletops to plazas
+    if low <= distance <= high and spacing <= max_spacing_m:
         return ""
     lengths = f"landmarks are {distance:.3g} m from the cameras that mapped them, and these {spacing:.3g} m from the "
-    lengths += f"nearest other (medians); plausible are {low:g} to {high:g} m, and at most {SPACING_M:g} m"
+    lengths += f"nearest other (medians); plausible are {low:g} to {high:g} m, and at most {max_spacing_m:g} m"
     fix = "Correct --scale, --distance or --positions. Ignore this warning if it is metric"
     return f"the model seems not to be in metres: {lengths}. {fix}"
 
@@ -91,20 +152,17 @@ def up_axis_warning(cam_from_world: ArrayLike) -> str:
     poses = np.asarray(cam_from_world, dtype=np.float64)
     gravity = estimate_gravity(poses)
     off_deg = float(np.degrees(np.arccos(np.clip(gravity.up[2], -1, 1))))
-    if off_deg <= TILT_DEG[gravity.method] or poses[:, 2, 2].mean() < -LOOKING_DOWN:
+    # people roll a camera by a few degrees, but may tilt all their photographs of an object
+    if off_deg <= {"level": 25.0, "mean": 50.0}[gravity.method] or poses[:, 2, 2].mean() < -LOOKING_DOWN:
         return ""
-    how = "upside down" if off_deg > 135 else "on their side" if off_deg > 45 else "askew"
-    up = " ".join(f"{value:.2f}" for value in np.round(gravity.up, 2) + 0.0)  # no -0.00
+    how = "on their side" if off_deg > 45 else "askew"
+    if off_deg > 135:
+        how = "upside down"
     return (
-        f"the cameras are {how}: the up direction estimated from their orientations is ({up}), {off_deg:.0f} degrees from z, which is "
-        "up here. --up level turns it upright. Ignore this warning if the cameras were held so"
+        f"the cameras are {how}: the up direction estimated from their orientations is ({_rounded(gravity.up)}), "
+        f"{off_deg:.0f} degrees from z, which is up here. --up level turns it upright. Ignore this warning if the "
+        "cameras were held so"
     )
-
-
-MAX_RATIO = 1.05  # of two scales that agree
-MAX_DEPTH_RATIO = 1.2  # of a scale and that of depth images, whose sensors are less accurate
-NOTABLE_DEG = 5.0  # smallest tilt that is stated
-MAX_TILT_DEG = 60.0  # median angle between a given up and the images' own, beyond which no camera was held like that
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,7 +197,7 @@ class MapFrame:
         """State a known scale and the direction up in one clause."""
         up = "z" if self.gravity == "model" else f"({_rounded(self.world_from_map.rotation[2])}), {self.gravity}"
         unit = f"1 unit of the map = {self.world_from_map.scale:.4g} m ({self.scale.describe()}), "
-        tilt = f", {self.tilt_deg:.0f} degrees from that of its cameras" if self.tilt_deg > NOTABLE_DEG else ""
+        tilt = f", {self.tilt_deg:.0f} degrees from that of its cameras" if self.tilt_deg > 5.0 else ""
         return f"{unit if self.scale.is_metric else ''}up: {up}{tilt}"
 
     def warn(self, model: Path, mapping_distance_m: ArrayLike, cam_from_world: ArrayLike) -> None:
@@ -248,7 +306,8 @@ def read_frame(map_dir: Path) -> MapFrame:
 
 def _check_agreement(scale: MapScale | None, reported: MapScale | None, by_depth: MapScale | None) -> None:
     """Raise ConfigError if a scale differs from the reported one, or from that of depth images."""
-    limits = ((reported, MAX_RATIO, "Leave it out"), (by_depth, MAX_DEPTH_RATIO, "Check --depth-scale"))
+    # depth sensors are less accurate
+    limits = ((reported, 1.05, "Leave it out"), (by_depth, 1.2, "Check --depth-scale"))
     for other, limit, fix in limits:
         if scale is not None and other is not None and abs(np.log(scale.factor / other.factor)) > np.log(limit):
             value = ", ".join(f"{one.source}: 1 unit = {one.factor:.4g} m" for one in (scale, other))
@@ -272,7 +331,7 @@ def _upright(
     rotation = rotation_to_z(up)
     off_deg = np.degrees(np.arccos(np.clip(-poses[:, 1, :3] @ rotation[2], -1, 1)))
     looking_down = (poses[:, 2, :3] @ rotation[2]).mean() < -LOOKING_DOWN
-    if rotation[2, 2] != 1 and np.median(off_deg) > MAX_TILT_DEG and not looking_down:
+    if rotation[2, 2] != 1 and np.median(off_deg) > 60 and not looking_down:  # no camera was held like that
         problem = (
             f"no camera agrees with this direction up: half were held {np.median(off_deg):.0f} degrees off or more"
         )

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pycolmap
 from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
@@ -18,9 +19,8 @@ from wheretolook.geometry.similarity import Similarity
 from wheretolook.mapping.colmap_model import colmap_poses, describe_cameras, read_model, registered_names, write_model
 from wheretolook.mapping.config import EXHAUSTIVE_UP_TO, PhotographsConfig
 from wheretolook.mapping.georeference import MapScale, MarkedPhotographs, check_tables
-from wheretolook.mapping.gravity import estimate_gravity
 from wheretolook.mapping.map_folder import MapDraft, MapReport, MapRun, finish_map, replacing_map
-from wheretolook.mapping.map_frame import IDENTITY, find_frame
+from wheretolook.mapping.map_frame import IDENTITY, estimate_gravity, find_frame
 from wheretolook.mapping.photographs import (
     PhotographCameras,
     list_photographs,
@@ -34,9 +34,7 @@ from wheretolook.utils.errors import ConfigError, MapError
 from wheretolook.utils.files import ArtifactCache, cache_key, storing_in_database, temporary_folder
 from wheretolook.utils.texts import quiet_colmap
 
-_MIN_IMAGES = 3  # of a model: two photographs do not determine a camera
 _MANIFEST = "steps.json"
-_VERSION = 2  # of the format of finished steps
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +71,8 @@ def photograph_features(
     extractor = run.config.extractor
     stats = [(folder / name).stat() for name in names]
     files = [(name, stat.st_size, stat.st_mtime_ns) for name, stat in zip(names, stats, strict=True)]
-    key = cache_key(_VERSION, files, max_side_px, extractor.record(), turned)
+    version = 2  # of the format of finished steps
+    key = cache_key(version, files, max_side_px, extractor.record(), turned)
     arrays = _cached_arrays(work, key, "features", lambda: _extract(folder, names, turned, max_side_px, run))
     ends = np.cumsum(arrays["counts"])[:-1]
     pixels, descriptors, colors = (np.split(arrays[name], ends) for name in ("pixels", "descriptors", "colors"))
@@ -155,8 +154,6 @@ def _extract(folder: Path, names: list[str], turned: bool, max_side_px: int, run
 
 def _unposed_model(features: PhotographFeatures, cameras: PhotographCameras) -> Any:
     """Make a reconstruction of photographs and their cameras, without poses."""
-    import pycolmap
-
     model = pycolmap.Reconstruction()
     for camera in cameras.cameras:
         model.add_camera_with_trivial_rig(camera)
@@ -168,13 +165,12 @@ def _unposed_model(features: PhotographFeatures, cameras: PhotographCameras) -> 
 
 def _reconstruct(database: Path, folder: Path, cameras: PhotographCameras, seed: int, run: MapRun) -> list[int]:
     """Verify matches, map, and write the largest model. Returns the number of photographs in each, largest first."""
-    import pycolmap
-
+    min_images = 3  # two photographs do not determine a camera
     threads = run.processes.workers
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = seed
     options = pycolmap.IncrementalPipelineOptions(random_seed=seed, num_threads=threads, extract_colors=False)
-    options.min_model_size = _MIN_IMAGES
+    options.min_model_size = min_images
     options.ba_refine_focal_length = options.ba_refine_extra_params = not cameras.given
     options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = not cameras.given
     options.triangulation.random_seed = options.mapper.random_seed = seed
@@ -188,14 +184,11 @@ def _reconstruct(database: Path, folder: Path, cameras: PhotographCameras, seed:
         mapped = pycolmap.incremental_mapping(str(database), str(models), str(models), options, **steps)
     ordered = sorted(mapped.values(), key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
     if not ordered:
-        fix = f"Give at least {_MIN_IMAGES} sharp photographs from different places, each of which overlaps the next;"
+        fix = f"Give at least {min_images} sharp photographs from different places, each of which overlaps the next;"
         fix += " a focal length (mapping.photographs.camera_params) helps."
         raise MapError("the photographs do not overlap enough for a map", path=database, fix=fix)
     write_model(ordered[0], folder)
     return [model.num_reg_images() for model in ordered]
-
-
-_FIX = "Raise `PhotographsConfig.max_reprojection_error_px`, or take sharper photographs."
 
 
 @dataclass(frozen=True)
@@ -252,7 +245,8 @@ def map_photographs(
             frame.world_from_map.transform_model(model)
             model.update_point_3d_errors()
         out_dir = Path(out_dir)
-        draft = MapDraft(model, out_dir, config.max_reprojection_error_px, _FIX, mapped.database, features.colors)
+        fix = "Raise `PhotographsConfig.max_reprojection_error_px`, or take sharper photographs."
+        draft = MapDraft(model, out_dir, config.max_reprojection_error_px, fix, mapped.database, features.colors)
         landmarks, fields = finish_map(draft, folder, run)
         registered = set(registered_names(model).values())
         report = PhotographMapReport(

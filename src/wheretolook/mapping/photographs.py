@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,9 +15,6 @@ from wheretolook.mapping.config import PhotographsConfig
 from wheretolook.utils.errors import ConfigError, MapError
 from wheretolook.utils.files import read_image
 from wheretolook.utils.texts import LOG, quiet_colmap
-
-if TYPE_CHECKING:
-    import pycolmap
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
 
@@ -83,7 +80,7 @@ def reduce_photograph(rgb: NDArray[np.uint8], max_side_px: int) -> NDArray[np.ui
 class PhotographCameras:
     """Initial intrinsics of photographs."""
 
-    cameras: list[pycolmap.Camera]  # of the reduced photographs, with ids from 1
+    cameras: list[Any]  # `pycolmap.Camera` of the reduced photographs, with ids from 1
     camera_of: NDArray[np.int64]  # (I,) each photograph's row in `cameras`
     given: bool  # whether the intrinsics stay fixed
 
@@ -106,16 +103,16 @@ def photograph_cameras(
         fix = "Omit camera_params, or map the photographs of each size separately."
         raise ConfigError("camera_params are for photographs of one size", path=folder, value=different, fix=fix)
     rows: dict[Any, int] = {}
-    cameras: list[pycolmap.Camera] = []
+    cameras: list[Any] = []
     camera_of = []
-    for name, full, reduced in zip(names, full_sizes.tolist(), sizes.tolist(), strict=True):
+    for name, full, (width, height) in zip(names, full_sizes.tolist(), sizes.tolist(), strict=True):
         camera = _camera(folder / name, full, config)
         shared = (str(Path(name).parent), *full, round(camera.mean_focal_length(), 3))
         row = rows.setdefault(shared if config.shared_camera else name, len(cameras))
         camera_of.append(row)
         if row == len(cameras):
             camera.camera_id = len(cameras) + 1
-            camera.rescale(*reduced)
+            camera.rescale(width, height)
             cameras.append(camera)
     return PhotographCameras(cameras, np.array(camera_of, dtype=np.int64), len(config.camera_params) > 0)
 
@@ -132,7 +129,7 @@ def photograph_pairs(n: int, exhaustive_up_to: int, overlap: int) -> NDArray[np.
     return np.array([(i, i + step) for i in range(n) for step in steps if i + step < n], dtype=np.int64)
 
 
-def _camera(path: Path, size: list[int], config: PhotographsConfig) -> pycolmap.Camera:
+def _camera(path: Path, size: list[int], config: PhotographsConfig) -> Any:
     """Initial intrinsics of a photograph at full size: given, or by the focal length in its EXIF data."""
     import pycolmap
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
+import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import csr_matrix
@@ -16,25 +17,7 @@ from scipy.spatial import cKDTree
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.mesh import TexturedMesh
 from wheretolook.geometry.poses import Float, poses_looking_along
-from wheretolook.mapping.config import (
-    CELL_M,
-    COVERAGE,
-    COVERAGES,
-    EYE_HEIGHT_M,
-    EYE_HEIGHT_VARIATION_M,
-    IMAGE_SPACING_M,
-    MAX_STEP_HEIGHT_M,
-    MIN_VARIED_IMAGES,
-    PARTNERS,
-    PITCH_DEG,
-    PITCH_VARIATION_DEG,
-    SHARES_OF_IMAGES,
-    SWING_DEG,
-    SWING_PERIOD,
-    UNEVENNESS,
-    VISIT_RADIUS_M,
-    MapConfig,
-)
+from wheretolook.mapping.config import PARTNERS, WALK, MapConfig
 from wheretolook.mapping.map_folder import DATABASE_FILE, IMAGES_FOLDER, MapDraft, MapReport, finish_map, replacing_map
 from wheretolook.mapping.triangulation import (
     choose_pairs,
@@ -46,16 +29,10 @@ from wheretolook.mapping.triangulation import (
     triangulate_model,
 )
 from wheretolook.rendering.appearance import Appearance
+from wheretolook.rendering.raycasting import MeshRaycaster
+from wheretolook.rendering.warp_renderer import Renderer
 from wheretolook.utils.errors import ConfigError, SceneError
 from wheretolook.utils.files import write_bytes
-
-if TYPE_CHECKING:
-    from wheretolook.rendering.raycasting import MeshRaycaster
-    from wheretolook.rendering.warp_renderer import Renderer
-
-
-_LOOK_AHEAD_M = 1.0  # the camera points to where the walk is after this distance
-_PROBE_SPACING_M = 1.0  # between the heights at which a floor is searched for, below a storey's height
 
 
 class FreeSpaceQueries(Protocol):
@@ -112,7 +89,7 @@ def plan_walk(
     bounds: ArrayLike,
     n_images: int,
     seed: int = 0,
-    coverage: float = COVERAGE,
+    coverage: float = WALK.coverage,
     unevenness: float = 0.0,
 ) -> Walk:
     """Plan a walk that starts at a random place and goes to the nearest unvisited floor until enough is visited.
@@ -127,16 +104,16 @@ def plan_walk(
     rng = np.random.default_rng(seed)
     eyes, steps = _reachable_places(free_space, np.asarray(bounds, dtype=np.float64))
     start = int(rng.integers(len(eyes)))
-    radius_m = VISIT_RADIUS_M
+    radius_m = WALK.visit_radius_m
     while True:
         corners, visited = _visit(steps, start, radius_m, coverage)
         path = eyes[corners]
-        if len(corners) == 1 or _length_m(path) <= (n_images - 1) * IMAGE_SPACING_M:
+        if len(corners) == 1 or _length_m(path) <= (n_images - 1) * WALK.image_spacing_m:
             break
         radius_m *= 1.2
     positions, headings = _along(path, n_images, rng, unevenness)
     varied = positions.copy()
-    varied[:, 2] += EYE_HEIGHT_VARIATION_M * rng.uniform(-1, 1, n_images)
+    varied[:, 2] += WALK.eye_height_variation_m * rng.uniform(-1, 1, n_images)
     free = free_space.segments_are_free(positions, varied)
     positions = np.where(free[:, None], varied, positions)
     return Walk(positions, _swing(headings, rng), path, visited, radius_m)
@@ -152,30 +129,30 @@ def _reachable_places(free_space: FreeSpaceQueries, bounds: Float) -> tuple[Floa
     Also returns the symmetric graph (P, P) of free steps between neighbouring cells, weighted by length.
     """
     low, high = bounds
-    n_cells = np.maximum(np.ceil((high - low)[:2] / CELL_M).astype(int), 1)
-    heights = np.arange(low[2] + EYE_HEIGHT_M, high[2] + EYE_HEIGHT_M, _PROBE_SPACING_M)
+    n_cells = np.maximum(np.ceil((high - low)[:2] / WALK.cell_m).astype(int), 1)
+    heights = np.arange(low[2] + WALK.eye_height_m, high[2] + WALK.eye_height_m, 1.0)  # below a storey's height
     *cell, level = np.indices((*n_cells, len(heights))).reshape(3, -1)
     cells = np.column_stack(cell)
-    probes = np.column_stack([low[:2] + (cells + 0.5) * CELL_M, heights[level]])
+    probes = np.column_stack([low[:2] + (cells + 0.5) * WALK.cell_m, heights[level]])
     probes[:, 2] = free_space.floor_below(probes)
     has_floor = np.isfinite(probes[:, 2])
     eyes = probes[has_floor]
     # Several probes of a cell may hit the same floor: one place for each floor of each cell.
     key = np.column_stack([cells[has_floor], np.rint(100 * eyes[:, 2])])
     key, first = np.unique(key, axis=0, return_index=True)
-    eyes = eyes[first] + (0, 0, EYE_HEIGHT_M)
+    eyes = eyes[first] + (0, 0, WALK.eye_height_m)
     free = (eyes[:, 2] < high[2]) & free_space.is_free(eyes)  # a roof is not a floor to walk on
     if not free.any():
         fix = "Check that the scene is in metres with z up, or lower the clearance of free space."
-        raise SceneError("there is no free floor to walk on at eye height", value=f"{EYE_HEIGHT_M} m", fix=fix)
+        raise SceneError("there is no free floor to walk on at eye height", value=f"{WALK.eye_height_m} m", fix=fix)
     eyes = eyes[free]
     cells = key[free, :2]
     a, b = cKDTree(cells).query_pairs(1, p=np.inf, output_type="ndarray").T
     # There must be floor at about the same height at both places and half way: no step off a gallery or over a gap.
     middle = (eyes[a] + eyes[b]) / 2
-    below = middle[:, 2] - EYE_HEIGHT_M - free_space.floor_below(middle)
+    below = middle[:, 2] - WALK.eye_height_m - free_space.floor_below(middle)
     drop = np.column_stack([eyes[a, 2] - eyes[b, 2], below])
-    near = (np.abs(drop) <= MAX_STEP_HEIGHT_M).all(1)  # False where there is no floor (NaN)
+    near = (np.abs(drop) <= WALK.max_step_height_m).all(1)  # False where there is no floor (NaN)
     near &= (cells[a] != cells[b]).any(1)
     near[near] = free_space.segments_are_free(eyes[a[near]], eyes[b[near]])
     a = a[near]
@@ -186,7 +163,7 @@ def _reachable_places(free_space: FreeSpaceQueries, bounds: Float) -> tuple[Floa
     members = np.flatnonzero(component == np.bincount(component).argmax())
     if len(members) < 2:
         problem = "no two neighbouring places of the floor are joined by a free step"
-        raise SceneError(problem, value=f"cell {CELL_M} m", fix="Lower the clearance of free space.")
+        raise SceneError(problem, value=f"cell {WALK.cell_m} m", fix="Lower the clearance of free space.")
     return eyes[members], steps[members][:, members]
 
 
@@ -222,8 +199,9 @@ def _along(path: Float, n_images: int, rng: np.random.Generator, unevenness: flo
     def point(s: Float) -> Float:
         return np.stack([np.interp(s, start, path[:, k]) for k in range(3)], axis=1)
 
-    behind = np.maximum(np.minimum(at, start[-1] - _LOOK_AHEAD_M), 0)
-    heading = (point(behind + _LOOK_AHEAD_M) - point(behind))[:, :2]
+    ahead_m = 1.0  # of the point that the camera looks at, along the walk
+    behind = np.maximum(np.minimum(at, start[-1] - ahead_m), 0)
+    heading = (point(behind + ahead_m) - point(behind))[:, :2]
     length = np.linalg.norm(heading, axis=1)
     angle = rng.uniform(0, 2 * np.pi)
     last = np.array([np.cos(angle), np.sin(angle)])
@@ -237,15 +215,11 @@ def _along(path: Float, n_images: int, rng: np.random.Generator, unevenness: flo
 def _swing(headings: Float, rng: np.random.Generator) -> Float:
     """Optical axes (n, 3) of a hand-held camera that swings about horizontal directions (n, 2)."""
     n = len(headings)
-    phase = 2 * np.pi * (np.arange(n) / SWING_PERIOD + rng.uniform())
+    phase = 2 * np.pi * (np.arange(n) / WALK.swing_period + rng.uniform())
     yaw = np.arctan2(headings[:, 1], headings[:, 0])
-    yaw = yaw + np.radians(SWING_DEG * np.sin(phase) + rng.normal(0, 5, n))
-    pitch = np.radians(PITCH_DEG + PITCH_VARIATION_DEG * rng.uniform(-1, 1, n))
+    yaw = yaw + np.radians(WALK.swing_deg * np.sin(phase) + rng.normal(0, 5, n))
+    pitch = np.radians(WALK.pitch_deg + WALK.pitch_variation_deg * rng.uniform(-1, 1, n))
     return np.column_stack([np.cos(pitch) * np.cos(yaw), np.cos(pitch) * np.sin(yaw), np.sin(pitch)])
-
-
-_RENDER_BATCH = 4
-_FIX = "Map with more images (n_images), or check that the scene has texture."
 
 
 @dataclass(frozen=True)
@@ -301,7 +275,8 @@ def build_map(  # a scene has four parts, and the output and its resources are t
             pairs = choose_pairs(surface_overlap(camera, poses, np.stack(depth)), PARTNERS)
         database = folder / DATABASE_FILE
         model = triangulate_model(database, posed_model(camera, poses), stored, colors, pairs, run)
-        draft = MapDraft(model, Path(out_dir), config.max_reprojection_error_px, _FIX, database)
+        fix = "Map with more images (n_images), or check that the scene has texture."
+        draft = MapDraft(model, Path(out_dir), config.max_reprojection_error_px, fix, database)
         landmarks, fields = finish_map(draft, folder, run)
         with clock("accuracy"):
             distance_cm = _distance_cm(landmarks.points, mesh, raycaster)
@@ -324,20 +299,20 @@ def build_map(  # a scene has four parts, and the output and its resources are t
 
 def _distance_cm(points: Float, mesh: TexturedMesh, raycaster: MeshRaycaster | None) -> Float:
     """Distances (N,) in centimetres from points (N, 3) to a mesh."""
-    from wheretolook.rendering.raycasting import MeshRaycaster
-
     limit_m = float(np.linalg.norm(mesh.bounds[1] - mesh.bounds[0]))
     return 100.0 * (raycaster or MeshRaycaster(mesh)).distance_to_surface(points, limit_m).astype(np.float64)
 
 
 def _walk(free_space: FreeSpaceQueries, mesh: TexturedMesh, config: MapConfig, seed: int) -> Walk:
-    """Plan the walk of a map; with `config.vary`, one of those in `mapping.config`."""
+    """Plan the walk of a map; with `config.vary`, draw coverage, unevenness and a share of the images."""
     if not config.vary:
         return plan_walk(free_space, mesh.bounds, config.n_images, seed)
     rng = np.random.default_rng([seed, 2])  # [seed, 1] draws the mapping camera
-    log_share, coverage, unevenness = (rng.uniform(*x) for x in (np.log(SHARES_OF_IMAGES), COVERAGES, UNEVENNESS))
-    n_images = max(MIN_VARIED_IMAGES, round(np.exp(log_share) * config.n_images))
-    return plan_walk(free_space, mesh.bounds, min(n_images, config.n_images), seed, coverage, unevenness)
+    share = np.exp(rng.uniform(np.log(0.08), np.log(1.0)))
+    coverage = rng.uniform(0.15, 0.8)
+    unevenness = rng.uniform(0.0, 2.0)
+    n_images = min(max(8, round(share * config.n_images)), config.n_images)
+    return plan_walk(free_space, mesh.bounds, n_images, seed, coverage, unevenness)
 
 
 def _rendered(
@@ -352,10 +327,9 @@ def _rendered(
 
     Images are written to a folder if one is given, and depth is added to `depth`.
     """
-    import cv2
-
-    for start in range(0, len(poses), _RENDER_BATCH):
-        rendering = renderer.render(camera, poses[start : start + _RENDER_BATCH])
+    batch = 4
+    for start in range(0, len(poses), batch):
+        rendering = renderer.render(camera, poses[start : start + batch])
         for index, (rgb, depth_m) in enumerate(zip(rendering.rgb, rendering.depth_m, strict=True), start):
             depth.append(shrink_depth(depth_m))
             if drawn:

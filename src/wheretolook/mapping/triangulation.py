@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pycolmap
 from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
@@ -23,11 +24,7 @@ from wheretolook.utils.files import storing_in_database, temporary_folder
 from wheretolook.utils.processes import WorkerPool
 from wheretolook.utils.texts import quiet_colmap
 
-_SAMPLES_ACROSS = 16  # surface points taken from an image, in x
 DEPTH_STRIDE = 4  # of the pixels of depth images that are used, at index 2 of each 4 x 4 block
-_ANGLE_DEG = (1.0, 55.0)  # between the rays of two images: smaller triangulates badly, larger does not match
-_MAX_DEPTH_RATIO = 2.5  # between the distances of two images to a point, beyond which scales differ too much
-_DEPTH_TOLERANCE = 0.05
 _PAIRS_AT_A_TIME = 64  # pairs in one job of a worker process
 MatchJob = tuple[NDArray[np.int64], list[Stored], Path, DescriptorKind]
 
@@ -62,8 +59,6 @@ def extract_with_colors(
 
 def posed_model(camera: PinholeCamera, cam_from_world: NDArray[np.floating[Any]]) -> Any:
     """Make a reconstruction of images of one camera at poses (I, 3, 4), without keypoints; image i has the id i + 1."""
-    import pycolmap
-
     model = pycolmap.Reconstruction()
     model.add_camera_with_trivial_rig(pycolmap.Camera(camera_id=1, **camera.colmap.record()))
     for index, pose in enumerate(np.asarray(cam_from_world, dtype=np.float64)):
@@ -88,8 +83,6 @@ def triangulate_model(
 
     Returns a `pycolmap.Reconstruction`, not yet filtered by reprojection error.
     """
-    import pycolmap
-
     clock = run.clock
     folder = database.parent
     kind = kind_of(run.config.extractor.method)
@@ -129,8 +122,6 @@ def triangulate_model(
 
 def write_matches(database: Path, pairs: NDArray[np.int64], matches: Iterable[NDArray[np.uint32]]) -> None:
     """Write matches (M, 2) of each pair (P, 2) of images into a COLMAP database; image i has the id i + 1."""
-    import pycolmap
-
     with pycolmap.Database.open(str(database)) as db:
         for (i, j), matched in zip(pairs.tolist(), matches, strict=True):
             db.write_matches(i + 1, j + 1, matched)
@@ -172,7 +163,6 @@ def _run_match_job(job: MatchJob) -> list[NDArray[np.uint32]]:
     pairs, stored, parent, kind = job
     if not kind.in_bytes:
         return _match_by_similarity(pairs, stored, kind)
-    import pycolmap
 
     matching = pycolmap.FeatureMatchingOptions(num_threads=1, skip_geometric_verification=True)
     with temporary_folder(parent=parent) as folder:
@@ -208,8 +198,6 @@ def fill_database(database: Path, model: Any, stored: Iterable[Stored], kind: De
 
     Descriptors that are not bytes are stored in single precision, as COLMAP 4 does.
     """
-    import pycolmap
-
     colmap_type = pycolmap.FeatureExtractorType(kind.colmap_type)
     with pycolmap.Database.open(str(database)) as db:
         for camera in model.cameras.values():
@@ -244,7 +232,7 @@ def surface_overlap(
     differ by less than a factor of 2.5. Returns the mean of both directions; 0 on the diagonal.
     """
     n, h, w = depth_m.shape
-    step = max(1, w // _SAMPLES_ACROSS)
+    step = max(1, w // 16)
     grid = np.meshgrid(np.arange(step // 2, h, step), np.arange(step // 2, w, step), indexing="ij")
     rows, columns = (axis.ravel() for axis in grid)
     pixels = np.column_stack([columns, rows]) * DEPTH_STRIDE + DEPTH_STRIDE // 2 + 0.5
@@ -254,7 +242,7 @@ def surface_overlap(
     points = centers[:, None] + depth[..., None] * (rays @ np.asarray(cam_from_world)[:, :, :3])
     seen_from = points - centers[:, None]
     seen_from /= np.maximum(np.linalg.norm(seen_from, axis=-1, keepdims=True), 1e-9)
-    closest, farthest = np.cos(np.radians(_ANGLE_DEG))
+    closest, farthest = np.cos(np.radians((1.0, 55.0)))  # less triangulates badly, more does not match
     share = np.zeros((n, n))
     for j in range(n):
         in_j = transform(cam_from_world[j], points.reshape(-1, 3)).reshape(points.shape)
@@ -265,8 +253,8 @@ def surface_overlap(
         there = depth_m[j, np.minimum(index[..., 1], h - 1), np.minimum(index[..., 0], w - 1)]
         ray = points - centers[j]
         cosine = (ray * seen_from).sum(-1) / np.maximum(np.linalg.norm(ray, axis=-1), 1e-9)
-        shared = inside & (np.abs(there - z) < _DEPTH_TOLERANCE * z) & (cosine > farthest) & (cosine < closest)
-        shared &= (z < _MAX_DEPTH_RATIO * depth) & (depth < _MAX_DEPTH_RATIO * z)
+        shared = inside & (np.abs(there - z) < 0.05 * z) & (cosine > farthest) & (cosine < closest)
+        shared &= (z < 2.5 * depth) & (depth < 2.5 * z)  # scales differ too much beyond
         share[:, j] = shared.mean(1)
     np.fill_diagonal(share, 0)
     return (share + share.T) / 2

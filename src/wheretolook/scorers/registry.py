@@ -77,7 +77,7 @@ def rule(scorer: type[Scorer], **fields: Any) -> Method:
 
 def imported(reference: str) -> Callable[..., Any]:
     """Return the function or class `module:name`, imported when called: PyTorch takes seconds to load."""
-    return lambda *arguments: resolve_name(reference)(*arguments)
+    return lambda *arguments, **options: resolve_name(reference)(*arguments, **options)
 
 
 def network_scorer(scorer: str, network: str, method: str) -> Callable[[LocalizationMap, BuildOptions], Scorer]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path, PurePath
 from typing import Any
@@ -23,13 +23,12 @@ from wheretolook.localization.config import LocalizerConfig
 from wheretolook.localization.localizer import Localizer
 from wheretolook.localization.rig import IDENTITY, Look, PosePrior, checked_turns, matches_among, read_turns
 from wheretolook.localization.rig_localization import POSES_OF_A_VIEW, POSES_OF_AN_IMAGE, JointLocalizer
-from wheretolook.mapping.colmap_model import ModelArrays, model_arrays, observation_matrix, read_model
+from wheretolook.mapping.colmap_model import ModelArrays, observation_matrix
 from wheretolook.mapping.config import FrameOptions
 from wheretolook.mapping.georeference import REPORT_FILE
-from wheretolook.mapping.landmarks import Landmarks, load_colmap_landmarks
-from wheretolook.mapping.map import find_features
-from wheretolook.mapping.map_folder import LANDMARKS_FILE
-from wheretolook.mapping.map_frame import MapFrame, find_frame
+from wheretolook.mapping.landmarks import Landmarks
+from wheretolook.mapping.map import Map, find_features
+from wheretolook.mapping.map_frame import MapFrame
 from wheretolook.select.localized import Localized, QueryImage, QueryImages, distinct_names
 from wheretolook.utils.errors import ConfigError, MapError, PoseError, TableError, from_record
 from wheretolook.utils.files import path_ends, read_json_object, read_text
@@ -46,8 +45,8 @@ class ImagePairs:
     observed: csr_array  # (I, N) which landmarks they observe
 
     @classmethod
-    def read(cls, path: Path, model: ModelArrays, landmark_ids: NDArray[np.int64]) -> ImagePairs:
-        """Read a file with lines "query mapping_image", given a model and the ids (N,) of its landmarks, ascending.
+    def read(cls, path: Path, model: ModelArrays) -> ImagePairs:
+        """Read a file with lines "query mapping_image", given a model whose points are its landmarks.
 
         Raises TableError if a line is not two names, or no image of the model is named.
         """
@@ -67,8 +66,7 @@ class ImagePairs:
         if not any(images.values()):
             fix = f"Its images have names such as {model.image_names[0]}." if model.image_names else ""
             raise TableError("no mapping image of the pairs is in the model", path=path, fix=fix)
-        points = np.intersect1d(model.point_ids, landmark_ids, return_indices=True)[1]
-        return cls(path, images, observation_matrix(model)[:, points])
+        return cls(path, images, observation_matrix(model))
 
     def landmarks(self, query: str) -> NDArray[np.int64]:
         """Return the rows of the landmarks of a query, by its path or the end of it. Raises TableError if it has none."""
@@ -122,27 +120,13 @@ class ImageLocalizer:
         `lightglue` as in `LocalizerConfig`. Raises MapError if the model cannot be read, or there
         are no descriptors, or none of the extractor's kind; ConfigError if an option is invalid.
         """
-        model = read_model(path)
-        arrays = model_arrays(model)
-        own = find_frame(path, model, frame, arrays=arrays)
-        arrays = own.of_arrays(arrays)
-        stored = path / LANDMARKS_FILE
-        kept = Landmarks.load(stored) if database is None and stored.is_file() else None
-        own_descriptors = kept is not None and kept.descriptors is not None
-        features = None if own_descriptors and not lightglue else database or find_features(path, model)
-        described_by = None if own_descriptors else features
-        landmarks = load_colmap_landmarks(path, described_by, None, device, model, arrays=arrays, ambiguity=False)
-        if kept is not None and own_descriptors:
-            if not np.array_equal(kept.ids, landmarks.ids):
-                problem = "the file has other landmarks than the model"
-                raise MapError(problem, path=stored, fix="Give --database, or run the map stage again.")
-            landmarks = replace(landmarks, descriptors=kept.descriptors, described_by=kept.described_by)
-        if landmarks.descriptors is None:
-            fix = "Give --database: the model's database.db, or hloc's feats-*.h5."
-            raise MapError("the landmarks have no descriptors, so nothing can be localized", path=path, fix=fix)
+        opened = Map.open_described(path, database, frame, device)
+        landmarks = opened.landmarks
+        assert opened.images is not None
+        features = database or (find_features(path) if lightglue else None)
         extractor = extractor or _extractor_of(path, landmarks)
-        of_images = None if pairs is None else ImagePairs.read(pairs, arrays, landmarks.ids)
-        result = cls(landmarks, own, QueryImages(model, path), extractor, device, of_images, lightglue, features)
+        of_images = None if pairs is None else ImagePairs.read(pairs, opened.images)
+        result = cls(landmarks, opened.frame, QueryImages(opened), extractor, device, of_images, lightglue, features)
         _ = result._localizer.extractor  # so that another extractor and missing weights are reported once
         return result
 

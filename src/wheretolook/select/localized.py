@@ -12,12 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wheretolook.dataset.config import CONTRADICTED, LOCALIZED, NO_POSE
-from wheretolook.geometry.camera import Camera, PinholeCamera, camera_of, cameras_by_id, describe_camera
+from wheretolook.geometry.camera import Camera, PinholeCamera, camera_of, describe_camera
 from wheretolook.geometry.camera_turns import pan_tilt_angles
 from wheretolook.geometry.pose_files import images_text
 from wheretolook.geometry.poses import Float, camera_centers, quaternion_from_rotation
 from wheretolook.localization.rig_localization import JointLocalization
-from wheretolook.mapping.colmap_model import find_camera, registered_names
+from wheretolook.mapping.colmap_model import find_camera
+from wheretolook.mapping.map import Map
 from wheretolook.mapping.map_frame import IDENTITY, MapFrame
 from wheretolook.mapping.photographs import read_photograph, reduce_photograph
 from wheretolook.utils.errors import ConfigError, PoseError
@@ -44,19 +45,19 @@ class QueryImage:
 
 
 class QueryImages:
-    """Reads images for a `pycolmap.Reconstruction` in a folder.
+    """Reads images to localize in a map, opened from a COLMAP model.
 
     The camera of an image is the given one. Otherwise it is the model's: that of the mapping image of the same name, or
     of those of the same proportions if their focal lengths agree; unless the EXIF focal length contradicts it.
     Otherwise it is a pinhole of the EXIF focal length.
     """
 
-    def __init__(self, model: Any, folder: Path) -> None:
-        self.folder = folder
-        self.model = model
-        self.cameras = cameras_by_id(model.cameras, folder)
-        names = registered_names(model)
-        self.by_name = {name: self.cameras[model.images[number].camera_id] for number, name in names.items()}
+    def __init__(self, opened: Map) -> None:
+        assert opened.path is not None and opened.images is not None
+        self.folder = opened.path
+        self.cameras = opened.cameras
+        ids = opened.images.image_cameras.tolist()
+        self.by_name = {name: self.cameras[i] for name, i in zip(opened.images.image_names, ids, strict=True)}
 
     def known_camera(self, camera: Camera | int | None) -> Camera | None:
         """Return a camera, given as one or by its camera_id. Raises MapError if the model has no such camera."""

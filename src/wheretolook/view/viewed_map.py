@@ -14,12 +14,14 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
 from scipy.spatial import cKDTree
 
-from wheretolook.dataset.layout import Dataset, find_scene
+from wheretolook.dataset.layout import Dataset, SceneFolder, find_scene
 from wheretolook.dataset.scene import ColmapFiles, Scene, SceneConfig
 from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.lattices import direction_lattice
 from wheretolook.geometry.poses import Float, camera_centers
+from wheretolook.geometry.views import Views
 from wheretolook.mapping.config import FrameOptions, place_name
+from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.mapping.map_frame import IDENTITY, mesh_warning, warn_of_mesh
 from wheretolook.scorers.registry import check_method, make_scorer, scorers
 from wheretolook.scorers.weights import resolve_weights, weights_by_method
@@ -31,22 +33,16 @@ from wheretolook.view.state import Paths, ViewState
 if TYPE_CHECKING:  # torch and Warp are imported when first needed: the page opens before them
     import pandas as pd
 
-    from wheretolook.dataset.layout import SceneFolder
-    from wheretolook.geometry.views import Views
     from wheretolook.inputs.localization_map import LocalizationMap
-    from wheretolook.mapping.landmarks import Landmarks
     from wheretolook.scorers.base import Scorer
     from wheretolook.select.where_to_look import WhereToLook
 
-FLOOR_DIRECTIONS = 96
-"""Directions per cell of a floor, 19 degrees apart: the best score is within 0.02 of that of 500 directions, in a third
-of the time."""
 
 FIRST_CELLS = 12  # scored before a floor is drawn
-BLOCK = 1 << 10  # labelled views scored per step
 
+CONFIG = SceneConfig(occlusion_cache_bytes=1 << 26)  # memory for lines of sight
+BLOCK = 1 << 10  # labelled views scored per step
 MAX_SCORERS = 8  # kept in memory; those of large maps take 100 MB each
-OCCLUSION_BYTES = 1 << 26  # memory for cached lines of sight
 
 
 @dataclass(eq=False)
@@ -102,7 +98,6 @@ def floor_at(selector: WhereToLook, height_m: float) -> Floor:
     """
     space = selector.space
     low, high = np.asarray(space.bounds, dtype=np.float64)[:, :2]
-    # about 1,200 cells in a floor's rectangle
     cell = max(0.1, float(np.sqrt(np.prod(high - low) / 1200)))
     columns, rows = (max(1, ceil(length)) for length in (high - low) / cell)
     lower = (low + high) / 2 - np.array([columns, rows]) * cell / 2
@@ -112,8 +107,7 @@ def floor_at(selector: WhereToLook, height_m: float) -> Floor:
     cells = np.flatnonzero(free)
     drawn_m = height_m
     if len(cells) and hasattr(space, "floor_below"):
-        # above carpets
-        drawn_m = float(np.median(space.floor_below(floor.points[cells]))) + 0.03
+        drawn_m = float(np.median(space.floor_below(floor.points[cells]))) + 0.03  # above carpets
     order = farthest_first(np.stack(np.divmod(cells, columns), axis=1))
     return Floor(selector, height_m, lower, cell, (rows, columns), cells[order], drawn_m)
 
@@ -290,7 +284,7 @@ class ViewedMap:
     # caches are shared by all maps of a process: usually it shows one
 
     @lru_cache(MAX_SCORERS)  # noqa: B019
-    def selector(self, method: str, occlusion: str, directions: int = 500) -> WhereToLook:
+    def selector(self, method: str, occlusion: str, directions: int = 500) -> WhereToLook:  # as by `wheretolook select`
         """Return the view selector of a method and an occlusion model.
 
         Scorers cache what depends on the directions, so each number of directions has its own. Raises ConfigError for
@@ -310,7 +304,8 @@ class ViewedMap:
     @lru_cache(64)  # noqa: B019
     def floor(self, method: str, occlusion: str, height_m: float) -> Floor:
         """Return the floor at a height, one object for all clients."""
-        return floor_at(self.selector(method, occlusion, FLOOR_DIRECTIONS), height_m)
+        # 19 degrees apart: the best score is within 0.02 of that of 500, in a third of the time
+        return floor_at(self.selector(method, occlusion, 96), height_m)
 
     @lru_cache(4)  # noqa: B019
     def mesh_glb(self, cut_m: float | None) -> bytes | None:
@@ -374,8 +369,7 @@ def open_map(
         ConfigError: there is no such camera.
         WeightsError: the weights cannot be used.
     """
-    config = SceneConfig(occlusion_cache_bytes=OCCLUSION_BYTES)
-    scene = Scene.of_colmap(ColmapFiles(path, mesh, frame=frame), camera, config=config, device=device)
+    scene = Scene.of_colmap(ColmapFiles(path, mesh, frame=frame), camera, config=CONFIG, device=device)
     landmarks = scene.landmarks
     if len(landmarks) == 0:
         raise MapError("the map has no landmarks", path=path, fix="Map it again.")
@@ -394,6 +388,8 @@ def open_scene(
     `dataset.layout.find_scene`, MapError or TableError if the scene has not been mapped, WeightsError if the weights
     cannot be used.
     """
+    from wheretolook.dataset.viewpoint_table import CAMERA_ID, UNLABELLED
+
     if not data.is_dir():
         fix = "Make a scene first, such as by `wheretolook demo`, or name a model: --map SPARSE."
         raise TableError("there is no such folder of datasets", path=data, fix=fix)
@@ -401,8 +397,7 @@ def open_scene(
     if not files.landmarks.is_file():
         raise MapError("this scene has no map yet", path=files.map, fix="Run `wheretolook map` for its dataset.")
     number, own_camera = next(iter(files.cameras().items()))
-    config = SceneConfig(occlusion_cache_bytes=OCCLUSION_BYTES)
-    scene = Scene(files, camera or own_camera, config, device)
+    scene = Scene(files, camera or own_camera, CONFIG, device)
     landmarks = scene.landmarks
     own = {"given": or_shipped(weights)} if weights else scene_weights(files, landmarks)
     labels = None

@@ -140,21 +140,18 @@ class HiddenPointRemoval(OcclusionModel):
     `radius` is R as a multiple of the distance from the location to the farthest landmark, at least 1. A landmark that
     would be free if it were `margin_m` nearer is free: what stands this close in front of it is its own surface, as in
     `MeshOcclusion`. A margin of 0 is the published method, with which a landmark is hidden by a neighbour a millimetre
-    nearer. `threads` locations are worked on at a time, 0 for one for each CPU core; the result is the same. A hull
-    takes about 0.4 KB a landmark while it is made. Raises a ConfigError if a value is out of range.
+    nearer. A location is worked on by each CPU core at a time. A hull takes about 0.4 KB a landmark while it is made. Raises a ConfigError if a value is out of range.
     """
 
     name = "hidden-points"
     uses_all_cores = True
     _lock = Lock()  # so that threads that ask about the same landmarks do not all sort them
 
-    def __init__(self, radius: float = OcclusionConfig.radius, margin_m: float = 0.05, threads: int = 0) -> None:
+    def __init__(self, radius: float = OcclusionConfig.radius, margin_m: float = 0.05) -> None:
         check_range("radius", radius, 1)
         check_range("margin_m", margin_m, 0)
-        check_range("threads", threads, 0)
         self.radius = float(radius)
         self.margin_m = float(margin_m)
-        self.threads = threads
         self._places: _Places | None = None  # of the landmarks that were asked about last
 
     @classmethod
@@ -173,7 +170,7 @@ class HiddenPointRemoval(OcclusionModel):
         def fill(row: int) -> None:
             free[row] = self._free_from(at[row], places.distinct)[places.place]
 
-        list(in_threads(fill, range(len(at)), self.threads or cores()))
+        list(in_threads(fill, range(len(at)), cores()))
         return free
 
     def check(self, locations: Float, points: Float) -> None:

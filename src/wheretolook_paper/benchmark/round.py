@@ -22,7 +22,7 @@ from wheretolook.localization.localizer import Localizer
 from wheretolook.mapping.colmap_model import MODEL_FILES, colmap_poses, model_arrays, read_model
 from wheretolook.mapping.config import PARTNERS, MapConfig
 from wheretolook.mapping.landmarks import Landmarks
-from wheretolook.mapping.map_folder import DATABASE_FILE, LANDMARKS_FILE, MapDraft, MapRun, finish_map
+from wheretolook.mapping.map_folder import DATABASE_FILE, MapDraft, MapRun, finish_map
 from wheretolook.mapping.triangulation import (
     choose_pairs,
     extract_with_colors,
@@ -270,6 +270,7 @@ class SceneRound:
 
     @cached_property
     def _localizer(self) -> Localizer:
+        from wheretolook.mapping.colmap_model import LANDMARKS_FILE
 
         folder = self.folder / MAP_FOLDER
         device = self.config.device

@@ -15,9 +15,9 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
+from wheretolook.dataset.config import SampleConfig
 from wheretolook.dataset.layout import Dataset
 from wheretolook.dataset.sampling import free_locations
-from wheretolook.dataset.sampling_config import SampleConfig
 from wheretolook.dataset.scene import Scene, SceneConfig
 from wheretolook.dataset.viewpoint_table import UNLABELLED, is_good, poses
 from wheretolook.geometry.lattices import VoxelGrid

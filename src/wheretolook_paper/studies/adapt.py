@@ -17,8 +17,8 @@ import pandas as pd
 from jsonargparse import auto_cli
 
 from wheretolook.commands.adapt import labelled_views
+from wheretolook.dataset.config import Split
 from wheretolook.dataset.layout import Dataset
-from wheretolook.dataset.sampling_config import Split
 from wheretolook.dataset.scene import Scene
 from wheretolook.dataset.viewpoint_table import CAMERA_ID, poses
 from wheretolook.evaluation.adaptation import compare_log_odds

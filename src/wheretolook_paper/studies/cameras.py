@@ -20,8 +20,8 @@ import pandas as pd
 from jsonargparse import auto_cli
 from sklearn.metrics import roc_auc_score
 
+from wheretolook.dataset.config import Split
 from wheretolook.dataset.layout import Dataset
-from wheretolook.dataset.sampling_config import Split
 from wheretolook.dataset.viewpoint_table import CAMERA_ID, is_good, poses
 from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.evaluation.scoring import score_scenes

@@ -43,8 +43,7 @@ from wheretolook.commands.map import BuildMap
 from wheretolook.commands.options import MeshSource, ScenesConfig
 from wheretolook.commands.sample import Sample
 from wheretolook.commands.scenes import Scenes
-from wheretolook.dataset.config import Accuracy
-from wheretolook.dataset.sampling_config import SampleConfig
+from wheretolook.dataset.config import Accuracy, SampleConfig
 from wheretolook.dataset.scene import Scene
 from wheretolook.dataset.viewpoint_table import poses as poses_of_table
 from wheretolook.evaluation.config import EvaluateConfig

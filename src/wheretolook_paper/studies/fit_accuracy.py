@@ -25,9 +25,8 @@ from sklearn.linear_model import LinearRegression, LogisticRegression
 from sklearn.metrics import roc_auc_score
 
 from wheretolook import load_scorer
-from wheretolook.dataset.config import ACCURACY, Accuracy
+from wheretolook.dataset.config import ACCURACY, Accuracy, Split
 from wheretolook.dataset.layout import Dataset, SceneFolder
-from wheretolook.dataset.sampling_config import Split
 from wheretolook.dataset.viewpoint_table import CAMERA_ID, LOCALIZED, poses
 from wheretolook.evaluation.statistics import expected_calibration_error
 from wheretolook.geometry.poses import Float

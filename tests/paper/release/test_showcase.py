@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from synthetic_dataset import make_landmarks, make_mapping_poses
+from wheretolook.dataset.config import SampleConfig
 from wheretolook.dataset.layout import Dataset, SceneFolder
 from wheretolook.dataset.sampling import free_locations, sample_viewpoints
-from wheretolook.dataset.sampling_config import SampleConfig
 from wheretolook.dataset.viewpoint_files import write_table
 from wheretolook.dataset.viewpoint_table import LOCALIZED, NO_POSE, poses
 from wheretolook.geometry.camera import PinholeCamera

@@ -4,33 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from functools import partial
+from typing import Any
 
 from wheretolook.inputs.channels import ALL_CHANNELS, PAPER_VARIANTS, Layout
 from wheretolook.scorers.registry import Learner, Method, imported, network_scorer
 from wheretolook.training.config import FittingConfig, Keep, Schedule
 from wheretolook.utils.errors import ConfigError, check_choice, check_range, check_share, no_option
-
-if TYPE_CHECKING:
-    from wheretolook.training.learner import TrainingJob, TrainingResult
-
-
-RELEASED_SETTINGS: dict[str, Any] = {
-    "learning_rate": 1e-4,
-    "schedule": "constant",
-    "l2": 0.0,
-    "dropout": 0.5,
-    "input_dropout": 0.5,
-    "hidden": (300, 300),
-    "layout": "compact",
-    "noise_px": 1.0,
-    "noise_m": 0.02,
-    "balance": True,  # half of each class, so that both have the weight 1
-    "keep": "last",
-    "patience": None,
-}
-"""Options of the paper's released code where they can differ from the paper's; batch size (128 there) and epochs stay
-as configured."""
 
 
 @dataclass(frozen=True)
@@ -93,10 +73,7 @@ class MlpConfig(FittingConfig):
 
 
 def _network(name: str, variant: str, channels: tuple[str, ...], settings: Mapping[str, Any] = {}) -> Method:
-    def learn(task: TrainingJob) -> TrainingResult:
-        result: TrainingResult = imported("wheretolook.scorers.mlp.learn:learn_mlp")(task, channels)
-        return result
-
+    learn = partial(imported("wheretolook.scorers.mlp.learn:learn_mlp"), channels=channels)
     return Method(
         name=name,
         about=f"The paper's classifier, {variant}: the predicted probability that a view localizes.",
@@ -118,5 +95,24 @@ METHODS = (
     _network("mlp-2d+z", "2d + z", PAPER_VARIANTS["2d+z"]),
     _network("mlp-2d+3d", "2d + 3d", PAPER_VARIANTS["2d+3d"]),
     _network("mlp-2d+3d+landmark", "2d + 3d + landmark", ALL_CHANNELS),
-    _network("mlp-released", "trained as the released code", PAPER_VARIANTS["2d+3d"], RELEASED_SETTINGS),
+    _network(
+        "mlp-released",
+        "trained as the released code",
+        PAPER_VARIANTS["2d+3d"],
+        # its options where they can differ from the paper's; batch size (128 there) and epochs stay as configured
+        {
+            "learning_rate": 1e-4,
+            "schedule": "constant",
+            "l2": 0.0,
+            "dropout": 0.5,
+            "input_dropout": 0.5,
+            "hidden": (300, 300),
+            "layout": "compact",
+            "noise_px": 1.0,
+            "noise_m": 0.02,
+            "balance": True,  # half of each class, so that both have the weight 1
+            "keep": "last",
+            "patience": None,
+        },
+    ),
 )

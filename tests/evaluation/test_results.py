@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
+from synthetic_scores import KEYS, make_scores
 from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.evaluation.ranking import RankedViews, choose_at_random, choose_best, rank_views
-from wheretolook.evaluation.results import reference_method, score_table, threshold_keys
+from wheretolook.evaluation.results import best_in_words, reference_method, score_table, threshold_keys
 from wheretolook.utils.errors import ConfigError
 
 HAND = RankedViews(
@@ -144,3 +145,17 @@ def test_calibration_columns_of_learned_methods():
 
 
 # Which methods chose best, in words.
+
+
+@pytest.mark.parametrize("reference", ["", "bins", "visible"])
+@pytest.mark.parametrize("good, significant", [(0.62, False), (0.8, True)])
+def test_summary_of_significance(reference, good, significant):
+    """Against visible, whose share is 0.6; intervals reach 6 points, those of differences 3."""
+    table = make_scores(("random", "bins", "visible"), reference or None, (1,), ("a",)).assign(reference=reference)
+    shares = table["method"].map({"random": 0.4, "bins": good, "visible": 0.6, "oracle": 0.9})
+    difference = shares - {"": np.nan, "bins": good, "visible": 0.6}[reference]
+    for name, values, width in (("raw", shares, 0.06), ("difference", difference, 0.03)):
+        table[f"{name}_{KEYS[0]}"] = values
+        table[f"{name}_low_{KEYS[0]}"] = values - width
+        table[f"{name}_high_{KEYS[0]}"] = values + width
+    assert ("significantly better" in best_in_words(table)) == significant

@@ -70,12 +70,12 @@ def test_a_training_that_cannot_be_logged_is_kept_and_logged_later(dataset, trac
 
 
 def test_an_evaluation_that_cannot_be_logged_is_kept_and_logged_later(dataset, tracking, monkeypatch):
-    from wheretolook.evaluation import run
+    from wheretolook.evaluation import scoring
 
     config = EvaluateConfig(("random", "visible"), resamples=50, top_n=(1,))
-    compare = run.compare_methods
+    compare = scoring.compare_methods
     with monkeypatch.context() as patch:
-        patch.setattr(run, "compare_methods", lambda *given: (break_store(tracking), compare(*given))[1])
+        patch.setattr(scoring, "compare_methods", lambda *given: (break_store(tracking), compare(*given))[1])
         with pytest.warns(TrackingWarning):
             table = evaluate_methods(dataset, config, tracking, progress=False)
     scores = (dataset.root / "results" / "scores.csv").read_bytes()

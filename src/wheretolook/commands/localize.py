@@ -179,7 +179,7 @@ class Localize(CameraOptions, FrameOptions):
             yield result
 
     def _draw(self, result: Localized, localizer: ImageLocalizer) -> None:
-        from wheretolook.figures.style import save_figure
+        from wheretolook.figures.floor_plan import save_figure
         from wheretolook.select.localized import figure_of
 
         save_figure(figure_of(result, localizer.landmarks.points), self._figure_of(result.names[0]))

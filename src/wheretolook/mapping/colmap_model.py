@@ -93,11 +93,17 @@ def without_marks(folder: Path, suffix: str) -> Iterator[Path]:
 
 def check_text_complete(path: Path, n_read: int) -> None:
     """Raise MapError if fewer entries were read than the number that COLMAP writes at the top of a text file."""
+    announced = _announced(path)
+    if n_read < announced:
+        raise MapError(f"the file is truncated: it announces {announced}", path=path, value=n_read, fix=REBUILD)
+
+
+def _announced(path: Path) -> int:
+    """Number of entries that COLMAP writes at the top of a text file; 0 if there is none."""
     with path.open(errors="replace") as file:
         head = "".join(line for line in itertools.islice(file, 6) if line.startswith("#"))
     announced = re.search(r"# Number of \w+: (\d+)", head)
-    if announced and n_read < int(announced[1]):
-        raise MapError(f"the file is truncated: it announces {announced[1]}", path=path, value=n_read, fix=REBUILD)
+    return int(announced[1]) if announced else 0
 
 
 def check_cameras_and_images(model: Any, folder: Path, suffix: str) -> None:
@@ -328,15 +334,26 @@ def _reprojections(model: Any) -> list[Float]:
 
 def _warn_of_larger(folder: Path, n_images: int) -> None:
     """Warn of a model of more images among those of one reconstruction: sparse/N of COLMAP, models/N of hloc."""
-    others = [*folder.glob("models/*/images.bin")]
+    others = [*folder.glob("models/*/images.*")]
     if folder.name.isdigit():
-        others += folder.parent.glob("[0-9]*/images.bin")
+        others += folder.parent.glob("[0-9]*/images.*")
     for path in others:
-        with suppress(OSError), path.open("rb") as file:
-            n_others = int.from_bytes(file.read(8), "little")  # as COLMAP begins the file
+        with suppress(OSError):
+            n_others = _count_images(path)
             if n_others > n_images:
                 text = f"{folder} has {n_images} images, the model in {path.parent} has {n_others:,}: is that the map?"
                 warnings.warn(text, MapWarning, stacklevel=3)
+
+
+def _count_images(path: Path) -> int:
+    """Number of images in an images.bin or images.txt; 0 for another file."""
+    if path.suffix == ".bin":
+        with path.open("rb") as file:
+            return int.from_bytes(file.read(8), "little")
+    if path.suffix != ".txt":
+        return 0
+    with path.open(errors="replace") as file:  # an image's line ends in its name, one of keypoints in a number
+        return _announced(path) or sum(bool(re.match(r"[^#\s].*[^\d\s]\s*$", line)) for line in file)
 
 
 def write_model(reconstruction: Any, folder: Path) -> None:

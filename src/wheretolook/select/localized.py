@@ -9,13 +9,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pandas as pd
+import pycolmap
 from numpy.typing import NDArray
 
 from wheretolook.dataset.config import CONTRADICTED, LOCALIZED, NO_POSE
 from wheretolook.geometry.camera import Camera, PinholeCamera, camera_of, describe_camera
-from wheretolook.geometry.camera_turns import pan_tilt_angles
 from wheretolook.geometry.pose_files import images_text
-from wheretolook.geometry.poses import Float, camera_centers, quaternion_from_rotation
+from wheretolook.geometry.poses import Float, camera_centers, pan_tilt_angles, quaternion_from_rotation
 from wheretolook.localization.rig_localization import JointLocalization
 from wheretolook.mapping.colmap_model import find_camera
 from wheretolook.mapping.map import Map
@@ -26,12 +27,9 @@ from wheretolook.utils.files import path_ends, write_json, write_text
 from wheretolook.utils.texts import quiet_colmap
 
 if TYPE_CHECKING:
-    import pandas as pd
     from matplotlib.figure import Figure
 
 
-MAX_SIDE_PX = 1600  # larger images are reduced
-MAX_SIDE_RATIO = 1.01  # of the proportions of an image and of its camera
 MAX_FOCAL_RATIO = 1.05  # of focal lengths that count as equal; those in EXIF data are rounded
 
 
@@ -125,14 +123,12 @@ def distinct_names(paths: Sequence[Path]) -> list[str]:
 def _has_proportions(camera: Camera, rgb: NDArray[np.uint8]) -> bool:
     height, width = rgb.shape[:2]
     ratio = width * camera.height / (height * camera.width)
-    return 1 / MAX_SIDE_RATIO <= ratio <= MAX_SIDE_RATIO
+    return 1 / 1.01 <= ratio <= 1.01
 
 
 def _fitted(name: str, rgb: NDArray[np.uint8], camera: Camera) -> QueryImage:
-    """Reduce an image to the size of its camera and to `MAX_SIDE_PX`, and return it with the camera of that size."""
-    import pycolmap
-
-    reduced = reduce_photograph(rgb, min(MAX_SIDE_PX, max(camera.width, camera.height)))
+    """Reduce an image to the size of its camera and to 1,600 px, and return it with the camera of that size."""
+    reduced = reduce_photograph(rgb, min(1600, max(camera.width, camera.height)))
     height, width = reduced.shape[:2]
     if (width, height) != (camera.width, camera.height):
         scaled = pycolmap.Camera(**camera.colmap.record())
@@ -143,8 +139,6 @@ def _fitted(name: str, rgb: NDArray[np.uint8], camera: Camera) -> QueryImage:
 
 def _exif_focal_px(path: Path) -> float | None:
     """Read the focal length of a photograph in pixels from its EXIF data; None without."""
-    import pycolmap
-
     options = pycolmap.ImageReaderOptions(camera_model="SIMPLE_PINHOLE")
     try:
         with quiet_colmap():
@@ -254,9 +248,8 @@ class Localized:
 
     def table(self) -> pd.DataFrame:
         """Return a row for each image; NaN where there is no pose."""
-        import pandas as pd
-
-        values = np.full((len(self), len(POSE_COLUMNS)), np.nan)
+        columns = (*"xyz", "yaw_deg", "pitch_deg", "qw", "qx", "qy", "qz", "deviation", "deviation_deg")
+        values = np.full((len(self), len(columns)), np.nan)
         if self.cam_from_world is not None:
             quaternions = quaternion_from_rotation(np.swapaxes(self.cam_from_world[:, :, :3], 1, 2))
             angles = np.degrees(pan_tilt_angles(self.cam_from_world[:, 2, :3] @ self.frame.world_from_map.rotation.T))
@@ -268,7 +261,7 @@ class Localized:
                 "image": self.names,
                 "status": self.status,
                 "probability": self.probability,
-                **dict(zip(POSE_COLUMNS, values.T, strict=True)),
+                **dict(zip(columns, values.T, strict=True)),
                 "n_matches": self.n_matches,
                 "n_inliers": self.n_inliers,
                 "n_rivals": len(self.rivals),
@@ -276,9 +269,6 @@ class Localized:
                 "reason": self.reason,
             }
         )
-
-
-POSE_COLUMNS = (*"xyz", "yaw_deg", "pitch_deg", "qw", "qx", "qy", "qz", "deviation", "deviation_deg")
 
 
 def check_localized_format(path: Path) -> str:
@@ -292,8 +282,6 @@ def check_localized_format(path: Path) -> str:
 
 def save_localized(results: Sequence[Localized], path: Path) -> None:
     """Write results to a file of the format of its name, atomically; images.txt has the localized ones only."""
-    import pandas as pd
-
     suffix = check_localized_format(path)
     if suffix == "csv":
         table = pd.concat([result.table() for result in results])

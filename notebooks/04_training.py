@@ -36,7 +36,7 @@ tracking = open_store(release)
 # of the image, each with the mean pixel of its landmarks, and depth or position.
 
 # %%
-from wheretolook.tracking.runs import newest_run
+from wheretolook.tracking import newest_run
 from wheretolook_paper.release.mlp_architecture import paper_architecture_table
 
 run = newest_run(tracking, "train", params={"dataset": release.name, "method": "mlp-2d+3d"})
@@ -78,7 +78,7 @@ display(training_figure(curves) if curves else Markdown(f"No run has a history y
 
 # %%
 from wheretolook.evaluation.statistics import read_calibration
-from wheretolook.tracking.runs import newest_artifact
+from wheretolook.tracking import newest_artifact
 from wheretolook_paper.figures.scores import calibration_figure
 
 calibration = read_calibration(newest_artifact(tracking, "evaluate", "calibration.csv", release.name))

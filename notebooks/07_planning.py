@@ -27,8 +27,8 @@ import pandas as pd
 from IPython.display import Markdown, display
 
 from wheretolook.planning.config import PathConfig, PlanConfig
-from wheretolook.planning.method_paths import path_views, plan_by_methods
-from wheretolook.tracking.runs import newest_artifact
+from wheretolook.planning.scene_map import path_views, plan_by_methods
+from wheretolook.tracking import newest_artifact
 from wheretolook_paper.figures.paths import (
     methods_figure,
     paths_figure,

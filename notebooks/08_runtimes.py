@@ -26,7 +26,7 @@
 import pandas as pd
 from IPython.display import Image, Markdown, display
 
-from wheretolook.tracking.runs import newest_artifact
+from wheretolook.tracking import newest_artifact
 from wheretolook_paper.release.notebook import open_release, open_store
 
 tracking = open_store(open_release())

@@ -16,7 +16,7 @@ from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import Float, poses_looking_along
 from wheretolook.localization import labeller
 from wheretolook.localization.shard import ShardWorker
-from wheretolook.tracking.store import TrackingConfig, client
+from wheretolook.tracking import TrackingConfig, client
 from wheretolook.utils.warp import start_warp
 from wheretolook.visibility.frustum import LandmarkSets
 

@@ -22,7 +22,7 @@ from wheretolook.planning.config import ViewpointMapConfig
 from wheretolook.planning.scene_map import build_viewpoint_map
 from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.scorers.registry import make_scorer, scorers
-from wheretolook.space.mapped_space import MappedSpace
+from wheretolook.space.free_space import MappedSpace
 from wheretolook.utils import devices as memory
 from wheretolook.utils.errors import ConfigError, SceneError
 from wheretolook.visibility.counting import SurveyOptions, survey

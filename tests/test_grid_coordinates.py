@@ -7,8 +7,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from box_scenes import ROOM, furnished_room
-from mapping.conftest import BoxFreeSpace, box_room
+from box_scenes import ROOM, box_room, furnished_room
 from planning.rooms import CAMERA, DIRECTIONS, GRID, free_voxels, room_landmarks
 from selection.room import POINTS, WEIGHTS, write_room
 from twins.open3d_renderer import Open3DRenderer
@@ -149,7 +148,7 @@ def test_scores_are_the_same_by_every_method(model):
         hides = MeshOcclusion(MeshRaycaster(mesh)) if model == "mesh" else HiddenPointRemoval()
         views.append((LocalizationMap(Map(there, mapping_poses=move(known)), CAMERA, hides), move(poses)))
     released = {"set": "set", "expected-inliers": "matchability", "mlp-2d+z": "mlp-2d+z"}
-    rules = [name for name, method in scorers().items() if method.learn is None and not method.weights]
+    rules = [name for name, method in scorers().items() if method.learner is None and not method.weights]
     for name in (*rules, *released) if model == "mesh" else ("visible",):
         # random numbers are drawn from the pose; and turns about the world's origin are, as the name says
         if name in ("random", "forward") or name.endswith("-origin"):
@@ -185,17 +184,9 @@ def test_a_colmap_model_gives_the_same_views(tmp_path):
 @pytest.mark.slow
 def test_a_map_is_triangulated_as_well(tmp_path):
     mesh = replace(box_room(), origin=SHIFT)
-
-    class There(BoxFreeSpace):
-        def is_free(self, points):
-            return super().is_free(np.asarray(points) - SHIFT)
-
-        def floor_below(self, points):
-            return super().floor_below(np.asarray(points) - SHIFT) + SHIFT[2]
-
     config = MapConfig(n_images=12)
     camera = PinholeCamera(320, 240, 160.0)
-    scene = mesh, WarpRenderer(mesh), There()
+    scene = mesh, WarpRenderer(mesh), FreeSpace(mesh)
     report = build_map(*scene, camera, config, 0, tmp_path / "map", workers=1, progress=False)
     assert report.n_landmarks > 200 and report.median_distance_to_mesh_cm < 1
 

@@ -231,7 +231,7 @@ def build_parser(name: str) -> Any:
     )
     parser.add_argument("--config", help="YAML file with a section for each group of options")
     parser.add_argument("--print_config", type=bool, default=False, help="only print all options as YAML")
-    groups = {"": parser}
+    groups: dict[str, Any] = {"": parser}
     for option, known in command_options(command).items():
         if known.group not in groups:
             groups[known.group] = parser.add_argument_group(known.group.rstrip("."))
@@ -308,11 +308,13 @@ def describe_type(kind: str) -> str:
 
 def full_name(command: Any, name: str) -> str:
     """Return the name of an option that is given by its short name, or with the group that the command leaves out."""
+    short = {known.replace("-", "_"): option for known, option in command.SHORT.items()}
+    if name in short:
+        return str(short[name])
     for group, prefix in command.GROUPS.items():
         if name.startswith(f"{group}."):
             name = prefix + name.removeprefix(f"{group}.")
-    full: str = command.SHORT.get(name) or command.SHORT.get(name.replace("_", "-"), name)
-    return full
+    return str(short.get(name, name))
 
 
 def option_of(name: str, known: Iterable[str]) -> str | None:

@@ -6,7 +6,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from wheretolook.tracking.runs import AUC, REGRET, SHARE
+from wheretolook.tracking import AUC, REGRET, SHARE
 
 
 @dataclass(frozen=True)

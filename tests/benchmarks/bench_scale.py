@@ -21,7 +21,7 @@ from common import ROOM_M, options, room_map, seconds_of, show, use_one_thread, 
 from wheretolook.features.extractor import quantize_descriptors
 from wheretolook.features.matches import match
 from wheretolook.features.matching import DescriptorIndex, DescriptorMatcher, has_index
-from wheretolook.figures.style import save_figure
+from wheretolook.figures.floor_plan import save_figure
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.lattices import fibonacci_sphere
 from wheretolook.geometry.poses import rotation_looking_along

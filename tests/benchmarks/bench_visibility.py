@@ -26,7 +26,7 @@ import trimesh
 import warp as wp
 from common import free_points, options, points_on_surface, seconds_of, show, write_csv
 
-from wheretolook.figures.style import save_figure
+from wheretolook.figures.floor_plan import save_figure
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.lattices import fibonacci_sphere
 from wheretolook.geometry.mesh import TexturedMesh
@@ -35,7 +35,7 @@ from wheretolook.rendering.raycasting import MeshRaycaster
 from wheretolook.scenes.config import ApartmentConfig
 from wheretolook.scenes.loading import load_mesh
 from wheretolook.space.free_space import FreeSpace
-from wheretolook.tracking.store import TrackingConfig
+from wheretolook.tracking import TrackingConfig
 from wheretolook.utils.processes import cores
 from wheretolook.utils.warp import start_warp
 from wheretolook.visibility.counting import FrustumCounter, SurveyOptions, survey

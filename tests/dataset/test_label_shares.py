@@ -20,8 +20,7 @@ from wheretolook.dataset.viewpoint_table import (
     label_shares,
     pooled_labels,
 )
-from wheretolook.tracking.runs import artifact, newest_run
-from wheretolook.tracking.store import TrackingConfig
+from wheretolook.tracking import TrackingConfig, artifact, newest_run
 from wheretolook.utils.errors import TableError
 
 

@@ -6,18 +6,22 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
+from synthetic_scores import KEYS, make_scores
 from wheretolook.evaluation.config import EvaluateConfig
-from wheretolook.evaluation.ranking import RankedViews, choose_at_random, choose_best, rank_views
-from wheretolook.evaluation.results import reference_method, score_table, threshold_keys
+from wheretolook.evaluation.ranking import choose_at_random, choose_best, rank_views
+from wheretolook.evaluation.results import best_in_words, reference_method, score_table, threshold_keys
+from wheretolook.geometry.views import Views
 from wheretolook.utils.errors import ConfigError
 
-HAND = RankedViews(
+LOCATION = np.array([2, 0, 0, 1, 0, 2, 0, 2])
+HAND = Views(
+    np.zeros((8, 3, 4)),
     # location 0 has four views, location 1 has one, location 2 has three, in mixed order
-    location=np.array([2, 0, 0, 1, 0, 2, 0, 2]),
+    waypoint=LOCATION,
     viewpoint_id=np.array([5, 12, 11, 9, 10, 6, 13, 7]),
     good=np.array([[1, 1], [0, 1], [1, 1], [0, 0], [0, 0], [0, 1], [1, 1], [0, 0]], dtype=bool),
-    location_scene=np.array([0, 0, 1]),
-    location_block=np.arange(3),
+    scene=np.array([0, 0, 1])[LOCATION],
+    block=LOCATION,
 )
 HAND_SCORES = np.array([0.2, 0.9, 0.5, 0.1, 0.5, 0.2, 0.4, 0.9])
 
@@ -44,7 +48,7 @@ def test_best_views_by_hand(n, chosen, good):
 def test_random_choice_by_enumeration(n):
     top = choose_at_random(HAND, n)
     for location in range(3):
-        good = HAND.good[HAND.location == location]
+        good = HAND.good[HAND.waypoint == location]
         draws = [good[list(rows)] for rows in combinations(range(len(good)), min(n, len(good)))]
         assert_allclose(top.good[location], np.mean([draw.sum(0) for draw in draws], axis=0))
         assert_allclose(top.any_good[location], np.mean([draw.any(0) for draw in draws], axis=0), atol=1e-12)
@@ -125,8 +129,8 @@ def test_reference_method():
 
 def test_a_scene_without_candidates_has_no_shares():
     config = EvaluateConfig(top_n=(1,), thresholds=((0.05, 0.4), (5.0, 10.0)), resamples=50)
-    in_a = HAND.location < 2
-    rows = score_table(HAND.only(in_a), {"mlp-2d": HAND_SCORES[in_a]}, ["a", "b"], config)
+    in_a = HAND.waypoint < 2
+    rows = score_table(HAND[in_a], {"mlp-2d": HAND_SCORES[in_a]}, ["a", "b"], config)
     rows = rows.set_index(["method", "scene"]).loc["mlp-2d"]
     assert rows.loc["b", "n_locations"] == 0 and np.isnan(rows.loc["b", "regret_5m_10deg"])
     assert rows.loc["all", "raw_5m_10deg"] == rows.loc["a", "raw_5m_10deg"] == 1 / 2
@@ -144,3 +148,17 @@ def test_calibration_columns_of_learned_methods():
 
 
 # Which methods chose best, in words.
+
+
+@pytest.mark.parametrize("reference", ["", "bins", "visible"])
+@pytest.mark.parametrize("good, significant", [(0.62, False), (0.8, True)])
+def test_summary_of_significance(reference, good, significant):
+    """Against visible, whose share is 0.6; intervals reach 6 points, those of differences 3."""
+    table = make_scores(("random", "bins", "visible"), reference or None, (1,), ("a",)).assign(reference=reference)
+    shares = table["method"].map({"random": 0.4, "bins": good, "visible": 0.6, "oracle": 0.9})
+    difference = shares - {"": np.nan, "bins": good, "visible": 0.6}[reference]
+    for name, values, width in (("raw", shares, 0.06), ("difference", difference, 0.03)):
+        table[f"{name}_{KEYS[0]}"] = values
+        table[f"{name}_low_{KEYS[0]}"] = values - width
+        table[f"{name}_high_{KEYS[0]}"] = values + width
+    assert ("significantly better" in best_in_words(table)) == significant

@@ -3,7 +3,7 @@
 import pytest
 
 from wheretolook.figures import KINDS
-from wheretolook.figures.style import new_figure, save_figure
+from wheretolook.figures.floor_plan import new_figure, save_figure
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -17,8 +17,7 @@ from wheretolook.holdout.photo_map import WORK, open_map
 from wheretolook.holdout.scores import evaluated_photographs
 from wheretolook.mapping.config import FrameOptions
 from wheretolook.scorers.set.network import SetNetwork
-from wheretolook.tracking.runs import finished_runs
-from wheretolook.tracking.store import TrackingConfig
+from wheretolook.tracking import TrackingConfig, finished_runs
 from wheretolook.training.trained_network import TrainedNetwork
 from wheretolook.training.weights import read_training
 from wheretolook.utils.package import WEIGHTS, shipped

@@ -13,7 +13,6 @@ import numpy as np
 import pandas as pd
 
 from box_scenes import HIGH_X, LOW_X, ROOM_SIZE, box_room
-from mapping.conftest import BoxFreeSpace
 from wheretolook.dataset.viewpoint_files import SCHEMA, write_table
 from wheretolook.dataset.viewpoint_table import UNLABELLED, pose_columns
 from wheretolook.geometry.camera import PinholeCamera
@@ -26,6 +25,7 @@ from wheretolook.mapping.rendered_map import build_map
 from wheretolook.rendering.raycasting import MeshRaycaster
 from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.scenes.loading import load_mesh, save_glb
+from wheretolook.space.free_space import FreeSpace
 
 CAMERA = PinholeCamera(320, 240, 160.0)
 PLAIN = HIGH_X
@@ -49,7 +49,7 @@ def map_room(folder, texture_m):
     mesh.textures[PLAIN][:] = 200
     save_glb(mesh, folder / "mesh.glb")
     mesh = load_mesh(folder / "mesh.glb")
-    inputs = (mesh, WarpRenderer(mesh), BoxFreeSpace(), CAMERA, MapConfig(n_images=24))
+    inputs = (mesh, WarpRenderer(mesh), FreeSpace(mesh), CAMERA, MapConfig(n_images=24))
     build_map(*inputs, seed=0, out_dir=folder / "map", raycaster=MeshRaycaster(mesh), workers=1, progress=False)
     return MappedRoom(folder / "mesh.glb", folder / "map" / "landmarks.npz")
 

@@ -12,7 +12,14 @@ from wheretolook.geometry.camera import ColmapCamera, PinholeCamera
 from wheretolook.geometry.poses import camera_centers, compose_poses, pose_error, poses_looking_along, transform
 from wheretolook.localization.confidence import probabilities
 from wheretolook.localization.config import LocalizerConfig
-from wheretolook.localization.estimation import PoseAmbiguity, PoseEstimator, match_under, turn_errors
+from wheretolook.localization.estimation import (
+    PoseAmbiguity,
+    PoseEstimator,
+    match_under,
+    most_likely,
+    strongest_rival,
+    turn_errors,
+)
 from wheretolook.localization.rig import MAX_NEAREST_RATIO, Candidates, Look, rig_of
 from wheretolook.localization.rig_localization import JointLocalizer
 from wheretolook.utils.errors import PoseError
@@ -271,6 +278,16 @@ def test_unique_support_outweighs_inliers_that_both_rooms_explain(n_column):
     assert found.n_inliers == (90 + 12 if n_column else 180)
     assert found.unique_support[1] == 0 and (found.unique_support[0] > 0) == (n_column > 0)
     assert found.rival_support == pytest.approx(180 if n_column else 90, abs=1)
+
+
+def test_the_pose_with_the_weakest_strongest_rival_is_selected():
+    """The second beats the first, the third beats the second, and the first beats the third by far."""
+    own = np.array([[0, 10, 50], [14, 0, 12], [12, 14, 0]])
+    support = [300.0, 230.0, 33.0]
+    assert [strongest_rival(own, support, k) for k in range(3)] == [1, 0, 0]
+    assert most_likely(own, support) == 1
+    assert most_likely(own[:1, :1], support[:1]) == 0 == most_likely(np.array([[0, 0], [50, 0]]), [300.0, 29.0])
+    assert most_likely(np.array([[0, 0], [50, 0]]), [300.0, 31.0]) == 1
 
 
 # Matching again under a pose finds the landmarks that the pose predicts, and none that it does not.

@@ -13,7 +13,7 @@ from wheretolook.geometry.lattices import direction_lattice
 from wheretolook.geometry.pose_information import bearing_numbers
 from wheretolook.geometry.poses import poses_looking_along, rotation_angle_deg, rotation_looking_along
 from wheretolook.looks.selection import (
-    CandidateViews,
+    Detections,
     Rotations,
     SetScoreModel,
     best_views,
@@ -43,7 +43,7 @@ def random_views(seed=0, d=9, u=30):
     rng = np.random.default_rng(seed)
     p_detect = (rng.random((d, u)) * (rng.random((d, u)) < 0.4)).astype(np.float32)
     terms = np.concatenate([np.ones((u, 1)), bearing_numbers(rng.normal(0, 2, (u, 3)))], 1)
-    return CandidateViews(p_detect, terms, (p_detect > 0).sum(1), rng.random(d))
+    return Detections(p_detect, terms, (p_detect > 0).sum(1), rng.random(d))
 
 
 def test_sums_of_a_set():
@@ -124,7 +124,7 @@ def test_new_landmarks_score_higher_than_the_same_again():
     views = random_views(u=60)
     p_detect = np.repeat(views.p_detect[:1], 3, axis=0)
     p_detect[2] = views.p_detect[0, ::-1]
-    same = CandidateViews(p_detect, views.terms, views.n_visible[:3], np.full(3, 0.3))
+    same = Detections(p_detect, views.terms, views.n_visible[:3], np.full(3, 0.3))
     assert score_of_set(same, MODEL, [0, 2]) > score_of_set(same, MODEL, [0, 1]) > score_of_set(same, MODEL, [0])
 
 

@@ -93,12 +93,6 @@ def test_time_does_not_grow_with_the_links_of_hdf5(tmp_path):
     assert time.process_time() - start < 1
 
 
-def test_a_file_that_is_no_hdf5(tmp_path):
-    (tmp_path / "feats.h5").write_bytes(b"not HDF5")
-    with pytest.raises(MapError):
-        read_features(tmp_path / "feats.h5", ["0.png"])
-
-
 RENAME = "ALTER TABLE keypoints RENAME TO away"
 NANS = np.full((N, 2), np.nan, "<f4").tobytes().hex()
 FLOATS = np.full((N, 128), 3e38, "<f4").tobytes().hex()
@@ -137,12 +131,14 @@ def test_invalid_databases_are_rejected(statements, tmp_path):
     assert caught.value.path == path
 
 
-@pytest.mark.parametrize("content", [None, b"", b"\x00garbage" * 999])
-def test_files_that_are_not_databases_are_rejected(content, tmp_path):
+@pytest.mark.parametrize(
+    ("name", "content"), [("a.db", None), ("a.db", b""), ("a.db", b"\x00garbage" * 999), ("feats.h5", b"not HDF5")]
+)
+def test_files_of_another_kind_are_rejected(name, content, tmp_path):
     if content is not None:
-        (tmp_path / "a.db").write_bytes(content)
+        (tmp_path / name).write_bytes(content)
     with pytest.raises(MapError):
-        read_features(tmp_path / "a.db", ["0.png"])
+        read_features(tmp_path / name, ["0.png"])
 
 
 def test_databases_of_other_keypoints_are_rejected(tmp_path):

@@ -87,10 +87,15 @@ def test_images_and_features_are_found_above_the_model(outputs, model):
     assert find_features(folder) == outputs / FEATURES.name
 
 
+@pytest.mark.parametrize("as_text", [False, True])
 @pytest.mark.parametrize("chosen, larger", [("sfm", "sfm/models/1"), ("sparse/0", "sparse/1")])
-def test_a_larger_model_of_the_same_images_is_reported(tmp_path, chosen, larger):
+def test_a_larger_model_of_the_same_images_is_reported(tmp_path, chosen, larger, as_text):
     write_model(hand_written_model()[0], tmp_path / chosen)
-    shutil.copytree(SFM, tmp_path / larger)
+    if as_text:
+        (tmp_path / larger).mkdir(parents=True)
+        read_model(SFM).write_text(str(tmp_path / larger))
+    else:
+        shutil.copytree(SFM, tmp_path / larger)
     with pytest.warns(MapWarning, match=larger):
         read_model(tmp_path / chosen)
 

@@ -6,44 +6,34 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from mapping.conftest import BoxFreeSpace
+from box_scenes import box_quads, quads_mesh
 from wheretolook.mapping import rendered_map as walk
 from wheretolook.mapping.config import WALK
 from wheretolook.mapping.rendered_map import plan_walk
+from wheretolook.space.config import FreeSpaceConfig
+from wheretolook.space.free_space import FreeSpace
 from wheretolook.utils.errors import ConfigError, SceneError
 
 SIZE = (8.0, 6.0, 2.6)
 BOUNDS = np.array([(0, 0, 0), SIZE])
 
 
+def free_space(size, boxes, clearance_m=0.2):
+    """Of a box seen from inside, with solid boxes in it."""
+    quads = [box_quads((0, 0, 0), size, inward=True), *(box_quads(*box) for box in boxes)]
+    mesh = quads_mesh(np.concatenate(quads), [np.zeros((1, 1, 3), np.uint8)])
+    return FreeSpace(mesh, FreeSpaceConfig(clearance_m=clearance_m))
+
+
 def two_rooms(door_m, clearance_m=0.2):
     """A box with a wall across it at x = 4 m that has a door of a given width at its low end."""
-    reach = 0.05 + clearance_m
-    return BoxFreeSpace(SIZE, clearance_m, ((4 - reach, door_m - clearance_m), (4 + reach, 99.0)))
+    return free_space(SIZE, [((3.95, door_m, 0), (4.05, 6, 2.6))], clearance_m)
 
 
-class TwoStoreys(BoxFreeSpace):
-    """The box again, twice as high, with a gallery 2.6 m up over x > 4 m and a ramp to it along y > 4.5 m."""
-
-    def _floors(self, points):
-        x = points[:, 0]
-        y = points[:, 1]
-        ramp = (y > 4.5) & (x > 1) & (x <= 4)
-        upper = np.where(ramp, 2.6 * (x - 1) / 3, np.where(x > 4, 2.6, 0.0))
-        return np.zeros(len(points)), upper
-
-    def is_free(self, points):
-        low = np.array([self.clearance_m] * 3)
-        high = np.array([SIZE[0], SIZE[1], 5.2]) - self.clearance_m
-        lower, upper = self._floors(points)
-        z = points[:, 2]
-        clear_of_upper = (z > upper + self.clearance_m) | (z < upper - 0.3 - self.clearance_m)
-        return ((points > low) & (points < high)).all(1) & (z > lower + self.clearance_m) & clear_of_upper
-
-    def floor_below(self, points):
-        lower, upper = self._floors(points)
-        inside = ((points[:, :2] > 0) & (points[:, :2] < SIZE[:2])).all(1) & (points[:, 2] >= 0)
-        return np.where(inside, np.where(points[:, 2] >= upper, upper, lower), np.nan)
+def two_storeys():
+    """The box again, twice as high, with a gallery 2.6 m up over x > 4 m and stairs to it along y > 4.5 m."""
+    steps = [((1 + 3 * k / 26, 4.5, 0), (4, 6, 0.1 * (k + 1))) for k in range(26)]
+    return free_space((8, 6, 5.2), [((4, 0, 2.3), (8, 6, 2.6)), *steps])
 
 
 def walked_distance_m(places, path):
@@ -106,13 +96,13 @@ def test_only_the_largest_reachable_part_is_walked():
 
 def test_walk_climbs_to_another_storey(monkeypatch):
     monkeypatch.setattr(walk, "WALK", replace(WALK, eye_height_variation_m=0.1))
-    scene = TwoStoreys(SIZE, 0.2)
+    scene = two_storeys()
     bounds = np.array([(0, 0, 0), (8, 6, 5.2)])
     route = plan_walk(scene, bounds, 300, 1, coverage=0.95)
     assert scene.segments_are_free(route.path[:-1], route.path[1:]).all()
-    floor = scene.floor_below(route.positions)
+    floor = scene.floor_below(route.positions).round(3)
     height = route.positions[:, 2] - floor
-    assert height.min() > 1.2
+    assert height.min() > 1.1
     assert (height < 1.7).mean() > 0.98  # beside the gallery's edge the straight way may hang over it a little
     assert (floor == 0).sum() > 30 and (floor == 2.6).sum() > 30
     assert ((floor > 0.3) & (floor < 2.3)).any()

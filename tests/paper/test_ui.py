@@ -8,8 +8,7 @@ from http.client import HTTPConnection
 
 import pytest
 
-from wheretolook.tracking.runs import experiment_id
-from wheretolook.tracking.store import TrackingConfig, client
+from wheretolook.tracking import TrackingConfig, client, experiment_id
 from wheretolook.utils.errors import InUseError, MissingRunError
 from wheretolook_paper.commands.ui import Ui, comparisons
 

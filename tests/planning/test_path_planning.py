@@ -5,10 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from wheretolook.geometry.camera_turns import pan_tilt_angles, pan_tilt_turns_deg
-from wheretolook.geometry.camera_turns import turns_deg as turns_deg_of_cameras
 from wheretolook.geometry.lattices import VoxelGrid, axes_of_angles, fibonacci_sphere
-from wheretolook.geometry.poses import rotation_angle_deg, rotation_looking_along
+from wheretolook.geometry.poses import pan_tilt_angles, pan_tilt_turns_deg, rotation_angle_deg, rotation_looking_along
+from wheretolook.geometry.poses import turns_deg as turns_deg_of_cameras
 from wheretolook.planning.config import PathConfig
 from wheretolook.planning.routes import turned_evenly
 from wheretolook.planning.rrt import PathRequest, are_separate, plan_path

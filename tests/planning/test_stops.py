@@ -12,8 +12,8 @@ from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.map import Map
 from wheretolook.planning.config import PathConfig, StopConfig
-from wheretolook.planning.method_paths import path_views
 from wheretolook.planning.routes import PlannedPath
+from wheretolook.planning.scene_map import path_views
 from wheretolook.planning.stops import stops_along, within_pitch
 from wheretolook.planning.view_sequence import TurnLimit, best_sequence
 from wheretolook.scorers.registry import make_scorer
@@ -82,16 +82,16 @@ def test_the_looks_of_a_path_are_in_order(scorer, path):
     free = replace(PLANNER, turn_weight_m=0.0)
     stops = stops_along(scorer, path.positions, path.axes, DIRECTIONS, StopConfig(3, 0.999), free)
     some = replace(path, stops=(stops[1], stops[3]))
-    places, looks = some.looks
+    views = path_views(some, scorer.localization_map)
+    places, looks = views.waypoint, views.rank
     first, second = (len(stops[place].axes) for place in (1, 3))
     assert places.tolist() == [0, 1, *[1] * first, 2, 3, *[3] * second, 4]
     assert looks.tolist() == [1, 1, *range(2, 2 + first), 1, 1, *range(2, 2 + second), 1]
     expected = scorer.score(poses_looking_along(path.positions[places], some.all_axes))
-    np.testing.assert_allclose(some.all_scores, expected, atol=0.05)
+    np.testing.assert_allclose(views.score, expected, atol=0.05)
     assert some.scores_with_stops[3] == stops[3].together
-    views = path_views(some, scorer.localization_map)
-    assert [view.look for view in views] == looks.tolist()
-    assert [np.isfinite(view.together) for view in views] == [view.n_looks > 1 for view in views]
+    np.testing.assert_array_equal(views.set_score, some.scores_with_stops[places])
+    assert len(views.pixels) == len(views) and all(len(pixels) for pixels in views.pixels)
 
 
 @pytest.mark.parametrize("options", [(0, 0.7), (7, 0.7), (2, 0.0), (2, float("nan"))])

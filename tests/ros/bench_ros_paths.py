@@ -21,8 +21,7 @@ from common import options as parse_options
 from common import write_csv
 
 from wheretolook.geometry.camera import PinholeCamera
-from wheretolook.geometry.camera_turns import pan_tilt_angles
-from wheretolook.geometry.poses import pose_error, poses_looking_along
+from wheretolook.geometry.poses import pan_tilt_angles, pose_error, poses_looking_along
 from wheretolook.planning.config import PathConfig
 from wheretolook.planning.rrt import plan_path
 from wheretolook.planning.view_sequence import TurnLimit, best_sequence

@@ -25,8 +25,7 @@ from wheretolook_ros.head import Head, Timeline
 
 from ros.processes import CAMERA, HEAD, JOINTS, Robot, base_at, environment, image_of, info_of, running
 from ros.room import room_mesh
-from wheretolook.geometry.camera_turns import pan_tilt_angles
-from wheretolook.geometry.poses import compose_poses, invert_poses
+from wheretolook.geometry.poses import compose_poses, invert_poses, pan_tilt_angles
 from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.robot.wheretolook_robot import RobotScorer
 

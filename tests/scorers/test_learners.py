@@ -21,7 +21,7 @@ from wheretolook.mapping.map import Map
 from wheretolook.scorers.registry import learned, make_scorer, scorers
 from wheretolook.scorers.set.network import MatchabilityNetwork
 from wheretolook.scorers.weights import load_scorer
-from wheretolook.tracking.store import TrackingConfig, client
+from wheretolook.tracking import TrackingConfig, client
 from wheretolook.training.trained_network import TrainedNetwork
 from wheretolook.training.weights import METADATA_KEY, method_of_weights, read_training
 from wheretolook.utils.errors import ConfigError, OutOfRangeWarning, TableError, WeightsError

@@ -21,7 +21,7 @@ from wheretolook.scorers import registry
 from wheretolook.scorers.registry import all_methods, make_scorer, methods_named, scorers
 from wheretolook.scorers.visible import METHODS
 from wheretolook.scorers.weights import load_scorer, resolve_weights
-from wheretolook.tracking.store import TrackingConfig, client
+from wheretolook.tracking import TrackingConfig, client
 from wheretolook.training.weights import read_weights, write_weights
 from wheretolook.utils.errors import ConfigError, WeightsError
 
@@ -118,8 +118,8 @@ from wheretolook.scenes.loading import save_glb
 from wheretolook.commands.evaluate import evaluate_methods
 from wheretolook.commands.train import train_methods
 from wheretolook.utils.files import write_json
-from wheretolook.tracking.runs import newest_run
-from wheretolook.tracking.store import TrackingConfig
+from wheretolook.tracking import newest_run
+from wheretolook.tracking import TrackingConfig
 
 Figure.savefig = lambda figure, file, **options: file.write(b"")  # figures are built, which is enough here
 folder = Path(sys.argv[1])

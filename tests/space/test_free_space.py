@@ -12,8 +12,7 @@ from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.geometry.tsdf import DepthImage, TsdfConfig, TsdfVolume
 from wheretolook.rendering.raycasting import MeshRaycaster
 from wheretolook.space.config import FreeSpaceConfig, MappedSpaceConfig
-from wheretolook.space.free_space import FreeSpace, TsdfSpace, seen_through
-from wheretolook.space.mapped_space import MappedSpace
+from wheretolook.space.free_space import FreeSpace, MappedSpace, TsdfSpace, seen_through
 from wheretolook.utils.errors import ConfigError, MapError
 
 
@@ -130,11 +129,6 @@ def test_floor_below():
     assert_array_equal(free_space.bounds, [(0, 0, 0), ROOM])
 
 
-def test_bad_config():
-    with pytest.raises(ConfigError):
-        FreeSpaceConfig(clearance_m=0.0)
-
-
 # Free space from depth images, compared with that from the mesh they were rendered from.
 
 VOXEL_M = 0.03
@@ -208,12 +202,22 @@ def test_bounds_reach_around_the_cameras_within_the_map():
     np.testing.assert_allclose(MappedSpace(outlier, CAMERAS).bounds, space.bounds)
 
 
-def test_bad_input_is_refused():
+def test_landmarks_are_needed():
     with pytest.raises(MapError):
         MappedSpace(np.zeros((0, 3)), CAMERAS)
-    for settings in ({"max_camera_distance_m": 0.0}, {"clearance_m": -0.1}):
-        with pytest.raises(ConfigError):
-            MappedSpaceConfig(**settings)
+
+
+@pytest.mark.parametrize(
+    ("config", "name", "value"),
+    [
+        (FreeSpaceConfig, "clearance_m", 0.0),
+        (MappedSpaceConfig, "max_camera_distance_m", 0.0),
+        (MappedSpaceConfig, "clearance_m", -0.1),
+    ],
+)
+def test_invalid_options(config, name, value):
+    with pytest.raises(ConfigError):
+        config(**{name: value})
 
 
 def test_ways_are_free_where_every_point_of_them_is(rng):

@@ -12,8 +12,7 @@ from wheretolook.dataset.viewpoint_files import write_table
 from wheretolook.dataset.viewpoint_table import is_good, poses
 from wheretolook.evaluation.adaptation import compare_log_odds
 from wheretolook.scorers.weights import load_scorer
-from wheretolook.tracking.runs import finished_runs
-from wheretolook.tracking.store import TrackingConfig
+from wheretolook.tracking import TrackingConfig, finished_runs
 from wheretolook.training.weights import read_training
 
 

@@ -19,8 +19,7 @@ from wheretolook.dataset.viewpoint_table import LABELS, NO_POSE, UNLABELLED, is_
 from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.evaluation.results import latest_scores
 from wheretolook.scorers.weights import load_scorer
-from wheretolook.tracking.runs import artifact, finished_runs, newest_run, start_run
-from wheretolook.tracking.store import TrackingConfig, client
+from wheretolook.tracking import TrackingConfig, artifact, client, finished_runs, newest_run, start_run
 from wheretolook.utils.errors import ConfigError, TableError, WeightsError
 
 pytestmark = pytest.mark.usefixtures("no_pictures")

@@ -9,7 +9,7 @@ from synthetic_dataset import make_dataset
 from wheretolook.cli import command_options, load_command, main
 from wheretolook.commands.train import train_methods
 from wheretolook.dataset.dataset_lock import changing, reading
-from wheretolook.tracking.store import TrackingConfig
+from wheretolook.tracking import TrackingConfig
 from wheretolook.training.trained_network import TrainedNetwork
 from wheretolook.utils.errors import InUseError
 

@@ -33,7 +33,7 @@ from wheretolook.planning.config import ViewpointMapConfig
 from wheretolook.rendering.raycasting import MeshRaycaster
 from wheretolook.scenes.loading import save_glb
 from wheretolook.space.config import MappedSpaceConfig
-from wheretolook.tracking.store import TrackingConfig
+from wheretolook.tracking import TrackingConfig
 from wheretolook.utils.errors import ConfigError, MapError, MapWarning, SceneError, WeightsError
 
 SIZE = (6.0, 5.0, 3.0)

@@ -24,8 +24,7 @@ from wheretolook.scorers.registry import scorers
 from wheretolook.scorers.train_config import TrainConfig
 from wheretolook.scorers.weights import load_scorer
 from wheretolook.space.free_space import FreeSpace, TsdfSpace
-from wheretolook.tracking.runs import finished_runs, newest_run
-from wheretolook.tracking.store import TrackingConfig
+from wheretolook.tracking import TrackingConfig, finished_runs, newest_run
 from wheretolook.utils.errors import TableError
 from wheretolook.utils.files import fingerprint, read_json_object
 from wheretolook.visibility.occlusion import StoredOcclusion

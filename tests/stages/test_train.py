@@ -17,7 +17,7 @@ from wheretolook.dataset.viewpoint_files import write_table
 from wheretolook.dataset.viewpoint_table import NO_POSE, UNLABELLED, is_good
 from wheretolook.scorers.mlp.network import ViewpointNetwork
 from wheretolook.scorers.weights import load_scorer
-from wheretolook.tracking.store import TrackingConfig, client
+from wheretolook.tracking import TrackingConfig, client
 from wheretolook.training.data import ViewpointDataModule, hold_out_locations
 from wheretolook.training.provenance import training_fingerprint, was_trained_on
 from wheretolook.training.trained_network import TrainedNetwork

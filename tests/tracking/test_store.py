@@ -10,8 +10,7 @@ from pathlib import Path
 import pytest
 
 from disks import fill, read_only, small_disk
-from wheretolook.tracking.runs import artifact, experiment_id, finished_runs, start_run
-from wheretolook.tracking.store import TrackingConfig, check_store, client
+from wheretolook.tracking import TrackingConfig, artifact, check_store, client, experiment_id, finished_runs, start_run
 from wheretolook.utils.errors import TrackingError
 
 SOON_S = 30.0
@@ -104,8 +103,8 @@ def test_a_disk_without_room_is_found_before_work_starts_and_can_be_read(tmp_pat
 
 MAKE = """
 import sys
-from wheretolook.tracking.runs import start_run
-from wheretolook.tracking.store import TrackingConfig
+from wheretolook.tracking import start_run
+from wheretolook.tracking import TrackingConfig
 print("ready", flush=True)
 sys.stdin.readline()
 with start_run(TrackingConfig(sys.argv[1]), "a", "train", {"dataset": "d"}):

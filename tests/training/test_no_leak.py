@@ -14,7 +14,7 @@ from wheretolook.dataset.viewpoint_files import read_table, write_table
 from wheretolook.dataset.viewpoint_table import LOCALIZED, is_good
 from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.scorers.registry import learned
-from wheretolook.tracking.store import TrackingConfig
+from wheretolook.tracking import TrackingConfig
 from wheretolook.training.weights import read_weights
 
 pytestmark = pytest.mark.usefixtures("no_pictures")

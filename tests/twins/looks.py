@@ -4,12 +4,12 @@ from itertools import combinations
 
 import numpy as np
 
-from wheretolook.looks.selection import N_SUMS, ViewSet, score_of_set
+from wheretolook.looks.selection import ViewSet, score_of_set
 
 
 def joint_sums(views, rows):
-    """`CandidateViews.joint_sums`, landmark by landmark."""
-    sums = np.zeros(N_SUMS)
+    """`Detections.joint_sums`, landmark by landmark."""
+    sums = np.zeros(16)
     for landmark, terms in enumerate(views.terms):
         missed = 1.0
         for row in rows:

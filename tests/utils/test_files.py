@@ -214,21 +214,18 @@ def test_images_are_read_as_they_are(tmp_path):
 
 # Names from files and options stay within the folder that they are names in.
 
-OUTSIDE = ["../victim", "/victim", "a/../../victim", "..", ".", "", "a/b", "a\0b"]
+UP = ["../victim", "/victim", "a/../../victim", "", "a\0b"]
 
 
-@pytest.mark.parametrize("name", [*OUTSIDE, 5, None])
-def test_a_name_is_one_entry_of_its_folder(name, tmp_path):
+@pytest.mark.parametrize(
+    ("inside", "name"),
+    [*((safe_child, name) for name in (*UP, "..", ".", "a/b", 5, None)), *((path_within, name) for name in UP)],
+)
+def test_a_name_stays_within_its_folder(inside, name, tmp_path):
     with pytest.raises(ConfigError):
-        safe_child(tmp_path, name, "a name")
-    assert safe_child(tmp_path, "my scene.1", "a name") == tmp_path / "my scene.1"
-
-
-@pytest.mark.parametrize("name", ["../1.jpg", "a/../../1.jpg", "/1.jpg", "", "1\0.jpg"])
-def test_a_path_within_a_folder_does_not_go_up(name, tmp_path):
-    with pytest.raises(ConfigError):
-        path_within(tmp_path, name, "a photograph's name")
-    assert path_within(tmp_path, "left/1.jpg", "a photograph's name") == tmp_path / "left" / "1.jpg"
+        inside(tmp_path, name, "a name")
+    assert inside(tmp_path, "my scene.1", "a name") == tmp_path / "my scene.1"
+    assert path_within(tmp_path, "left/1.jpg", "a photograph") == tmp_path / "left" / "1.jpg"
 
 
 @pytest.mark.parametrize("name", ["../victim", "/victim"])

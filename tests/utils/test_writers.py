@@ -14,7 +14,7 @@ from colmap_models import camera, model_of
 from disks import file_limit, fill, read_only, small_disk
 from synthetic_dataset import make_mapping_poses
 from wheretolook.dataset.viewpoint_files import SCHEMA, write_table
-from wheretolook.figures.style import save_figure
+from wheretolook.figures.floor_plan import save_figure
 from wheretolook.mapping.colmap_model import colmap_poses, write_model
 from wheretolook.scenes.loading import save_glb
 from wheretolook.training.weights import write_weights

@@ -7,9 +7,10 @@ pytest.importorskip("viser")
 
 from selection.room import POINTS, WEIGHTS, write_room
 from wheretolook.geometry.poses import poses_looking_along, rotation_from_quaternion
+from wheretolook.geometry.views import Views
 from wheretolook.planning.config import FORWARD
 from wheretolook.view.server import Viewer
-from wheretolook.view.state import RecordedPath, ViewState, looking_ahead
+from wheretolook.view.state import ViewState, looking_ahead
 from wheretolook.view.viewed_map import open_map
 from wheretolook_paper.studies.browser import Browser, chromium
 
@@ -23,7 +24,7 @@ def viewer(tmp_path_factory):
     viewed = open_map(write_room(tmp_path_factory.mktemp("room") / "sparse"), weights=WEIGHTS)
     poses = poses_looking_along(POINTS, np.tile((-1.0, -0.5, 0.0), (4, 1)))
     localized = np.array([True, True, False, True])
-    viewed.paths = {FORWARD: RecordedPath(looking_ahead(POINTS)), "set": RecordedPath(poses, localized)}
+    viewed.paths = {FORWARD: Views(looking_ahead(POINTS)), "set": Views(poses, good=localized)}
     made = Viewer(viewed, port=0, state=ViewState(occlusion="none"))
     yield made
     made.stop()

@@ -43,7 +43,7 @@ def test_a_path_is_shown_next_to_a_camera_that_looks_ahead(tmp_path):
     (tmp_path / "way.tum").write_text(tum_text("0123", poses))
     for name, method in (("", "planned"), ("way.tum", "way")):
         paths = read_paths(tmp_path / name)
-        assert [*paths] == [FORWARD, method] and paths[method].localized is None
+        assert [*paths] == [FORWARD, method] and paths[method].good is None
         np.testing.assert_allclose(paths[method].cam_from_world, poses, atol=1e-5)
         np.testing.assert_allclose(camera_centers(paths[FORWARD].cam_from_world), POINTS, atol=1e-5)
 
@@ -55,11 +55,11 @@ def test_compared_paths_have_labels_if_there_are_any(tmp_path):
     scene = tmp_path / "paths" / "compared"
     scene.mkdir(parents=True)
     table.to_parquet(scene / "views.parquet")
-    assert read_paths(scene, 1)["set"].localized is None
+    assert read_paths(scene, 1)["set"].good is None
     far = np.where(table["method"] == "forward", 1.0, 0.01)
     labelled = table.assign(scene="compared", status="localized", error_m=far, error_deg=0.1)
     labelled.to_parquet(scene.parent / "views.parquet")
-    localized = [path.localized for path in read_paths(scene, 1).values()]
+    localized = [path.good for path in read_paths(scene, 1).values()]
     np.testing.assert_array_equal(localized, [[False] * 4, [True] * 4])
     with pytest.raises(TableError):
         read_paths(scene, 7)

@@ -20,12 +20,13 @@ from selection.room import POINTS, WEIGHTS, write_room
 from waiting import wait_until
 from wheretolook.cli import main
 from wheretolook.geometry.poses import camera_centers
+from wheretolook.geometry.views import Views
 from wheretolook.planning.config import FORWARD
 from wheretolook.scenes.loading import save_glb
 from wheretolook.utils.errors import ConfigError, InUseError, MapWarning
 from wheretolook.view.drawing import escape_markdown
 from wheretolook.view.server import Viewer, check_port
-from wheretolook.view.state import RecordedPath, ViewState, looking_ahead
+from wheretolook.view.state import ViewState, looking_ahead
 from wheretolook.view.viewed_map import open_map
 
 STATE = ViewState(method="visible", occlusion="none")
@@ -39,7 +40,7 @@ def sparse(tmp_path_factory):
 @pytest.fixture
 def viewer(sparse):
     viewed = open_map(sparse, weights=WEIGHTS)
-    viewed.paths = {FORWARD: RecordedPath(looking_ahead(np.tile(POINTS, (20, 1))))}
+    viewed.paths = {FORWARD: Views(looking_ahead(np.tile(POINTS, (20, 1))))}
     made = Viewer(viewed, port=0, state=STATE)
     yield made
     made.stop()

@@ -33,9 +33,8 @@ from wheretolook.mapping.colmap_model import read_model
 from wheretolook.mapping.config import FrameOptions, place_name
 from wheretolook.mapping.map_frame import find_frame
 from wheretolook.scorers.weights import load_scorer, resolve_weights
-from wheretolook.tracking.runs import log as log_to_run
-from wheretolook.tracking.runs import start_run
-from wheretolook.tracking.store import TrackingConfig, check_store, kept_if_not_logged
+from wheretolook.tracking import TrackingConfig, check_store, kept_if_not_logged, start_run
+from wheretolook.tracking import log as log_to_run
 from wheretolook.utils.errors import (
     ConfigError,
     MapError,

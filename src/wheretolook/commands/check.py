@@ -157,7 +157,7 @@ class Check(ScorerOptions, FrameOptions):
         if self.map is not None:
             model_suffix(self.map)
         # the imports above are light, those below take seconds
-        from wheretolook.figures.style import save_figure
+        from wheretolook.figures.floor_plan import save_figure
         from wheretolook.holdout.photo_map import WORK, folder_of_check
         from wheretolook.holdout.report import check_figure, check_map
         from wheretolook.holdout.scores import Scoring

@@ -22,8 +22,7 @@ from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.scorers.registry import methods_named, scorers
 from wheretolook.scorers.train_config import TrainConfig
 from wheretolook.scorers.weights import resolve_weights
-from wheretolook.tracking.runs import ui_command
-from wheretolook.tracking.store import check_store
+from wheretolook.tracking import check_store, ui_command
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.files import ArtifactCache, cache_key, fingerprint
 from wheretolook.utils.package import VERSION, reports

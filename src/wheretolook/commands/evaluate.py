@@ -21,7 +21,7 @@ from wheretolook.dataset.dataset_lock import reading, reads_dataset
 from wheretolook.dataset.layout import Dataset
 from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.scorers.registry import describe_methods
-from wheretolook.tracking.store import TrackingConfig, check_store, kept_if_not_logged
+from wheretolook.tracking import TrackingConfig, check_store, kept_if_not_logged
 from wheretolook.utils.errors import MapError
 from wheretolook.utils.files import write_text
 from wheretolook.utils.package import reports
@@ -141,7 +141,7 @@ def evaluate_methods(
             says that they are not logged.
     """
     from wheretolook.evaluation.results import best_in_words, log_evaluation, results_folder
-    from wheretolook.evaluation.run import compare_methods
+    from wheretolook.evaluation.scoring import compare_methods
 
     title = f"Localization score on {dataset.name}" + (f", {config.split} scenes" if config.split != "test" else "")
     folder = results_folder(dataset, config)

@@ -19,7 +19,7 @@ from wheretolook.localization.config import LabelConfig
 from wheretolook.mapping.config import MapConfig
 from wheretolook.scenes.config import ApartmentConfig, SceneKind
 from wheretolook.space.config import FreeSpaceConfig, MappedSpaceConfig
-from wheretolook.tracking.store import TrackingConfig
+from wheretolook.tracking import TrackingConfig
 from wheretolook.utils.devices import check_device_name, usable_device
 from wheretolook.utils.errors import ConfigError, MapError, SceneError, TableError, WeightsError, from_record, reject
 from wheretolook.utils.files import (

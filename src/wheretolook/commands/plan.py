@@ -11,14 +11,11 @@ import numpy as np
 from wheretolook.commands.map import SceneOrMapOptions, imports_map
 from wheretolook.commands.options import Log, Progress, ignore_progress, load_dataset, open_scene
 from wheretolook.dataset.dataset_lock import reads_dataset
-from wheretolook.geometry.camera import Camera
-from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.geometry.similarity import Similarity
 from wheretolook.planning.config import PlanConfig
 from wheretolook.planning.view_sequence import lengths_along
-from wheretolook.tracking.runs import joined, start_run
-from wheretolook.tracking.runs import log as log_to_run
-from wheretolook.tracking.store import TrackingConfig, check_store, kept_if_not_logged
+from wheretolook.tracking import TrackingConfig, check_store, joined, kept_if_not_logged, start_run
+from wheretolook.tracking import log as log_to_run
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.files import write_text
 from wheretolook.utils.package import reports, require
@@ -28,7 +25,8 @@ from wheretolook.utils.texts import score_text
 if TYPE_CHECKING:
     import pandas as pd
 
-    from wheretolook.planning.routes import PathView, PlannedPath
+    from wheretolook.geometry.views import Views
+    from wheretolook.planning.routes import PlannedPath
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,7 +66,7 @@ class Plan(SceneOrMapOptions):
             SceneError, MapError: the scene has no free location, or no map with a scale.
             TrackingError: the tracking store cannot be used.
         """
-        from wheretolook.planning.method_paths import path_views, plan_by_methods
+        from wheretolook.planning.scene_map import path_views, plan_by_methods
 
         dataset = load_dataset(self, "map")
         config = self.plan
@@ -96,7 +94,7 @@ class Plan(SceneOrMapOptions):
             table = _table(path, scene.frame.world_from_map.inverse, stopping=config.stops.looks > 1)
             write_text(folder / "path.csv", table.to_csv(index=False, lineterminator="\n"))
             if config.rerun:
-                _record(views[method], scene.landmarks.points, scene.camera, folder / "path.rrd")
+                _record(views[method], scene.landmarks.points, folder / "path.rrd")
                 written.append("path.rrd")
             written.insert(0, "path.csv")
             with kept_if_not_logged(f"the path in {folder}"):
@@ -106,9 +104,6 @@ class Plan(SceneOrMapOptions):
         return path
 
 
-WAIT_S = 120.0  # another plan may be writing its path into the same folder
-
-
 def _summary(path: PlannedPath) -> str:
     """Describe a path and its stops in a line."""
     text = f"{path.length_m:.2f} m, {path.turn_deg:.0f} degrees of turning, views: {len(path.positions)}"
@@ -116,7 +111,7 @@ def _summary(path: PlannedPath) -> str:
         text += f", mean score {score_text(float(np.mean(path.scores)))}"
     if path.stops:
         along = lengths_along(path.positions)[[stop.place for stop in path.stops]]
-        n_further = path.n_looks - len(path.positions)
+        n_further = sum(len(stop.axes) for stop in path.stops)
         text += f", {n_further} further looks at stops at {', '.join(f'{at:.2f}' for at in along)} m"
         text += f": mean score {score_text(float(path.scores_with_stops.mean()))}"
     return text
@@ -149,29 +144,31 @@ def _table(path: PlannedPath, map_from_world: Similarity, stopping: bool) -> pd.
 
     from wheretolook.dataset.viewpoint_table import pose_columns
 
-    places, looks = path.looks
-    at = map_from_world.apply(path.positions[places])
+    views = path.views
+    at = map_from_world.apply(path.positions[views.waypoint])
     along = path.all_axes @ map_from_world.rotation.T
     unit = "m" if map_from_world.scale == 1 else "units"
     names = (*(f"{axis}_{unit}" for axis in "xyz"), "axis_x", "axis_y", "axis_z")
     columns = dict(zip(names, (*at.T, *along.T), strict=True))
-    poses = map_from_world.apply_to_poses(poses_looking_along(path.positions[places], path.all_axes))
-    table = pd.DataFrame({**columns, "score": path.all_scores, **pose_columns(poses)})
+    poses = map_from_world.apply_to_poses(views.cam_from_world)
+    table = pd.DataFrame({**columns, "score": views.score, **pose_columns(poses)})
     if stopping:
-        joint_scores = pd.Series({stop.place: stop.together for stop in path.stops}, dtype=float)
-        table = table.assign(look=looks, together=joint_scores.reindex(places).to_numpy())
+        at_stop = np.bincount(views.waypoint)[views.waypoint] > 1
+        table = table.assign(look=views.rank, together=np.where(at_stop, views.set_score, np.nan))
     return table
 
 
-def _record(views: list[PathView], landmarks: np.ndarray, camera: Camera, file: Path) -> None:
+def _record(views: Views, landmarks: np.ndarray, file: Path) -> None:
     """Write a Rerun recording: landmarks, path, and the camera moving along it with image, landmarks and score."""
     from wheretolook.view.recording import open_recording
 
+    assert views.camera is not None
     with open_recording(file) as recording:
         recording.log_landmarks(landmarks, 0.008)
-        recording.log_line("world/path", np.array([view.position for view in views]))
-        for number, view in enumerate(views):
+        recording.log_line("world/path", views.positions)
+        for number, pose in enumerate(views.cam_from_world):
+            image = None if views.images is None else views.images[number]
             recording.stream.set_time("view", sequence=number)
-            recording.log_camera("world/camera", poses_looking_along(view.position, view.axis), camera, view.rgb)
-            recording.stream.log("world/camera/landmarks", recording.rerun.Points2D(view.pixels))
-            recording.stream.log("score", recording.rerun.Scalars(view.score))
+            recording.log_camera("world/camera", pose, views.camera, image)
+            recording.stream.log("world/camera/landmarks", recording.rerun.Points2D(views.pixels[number]))
+            recording.stream.log("score", recording.rerun.Scalars(views.score[number]))

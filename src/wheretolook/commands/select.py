@@ -112,7 +112,7 @@ def finish(command: SelectorOptions, selector: WhereToLook, views: Views, given:
     """Write views and the floor plan, and print a summary; `locations` names the kind of what was `given`."""
     views.save(command.out, command.format)
     if command.floor_plan is not None:
-        from wheretolook.figures.style import save_figure
+        from wheretolook.figures.floor_plan import save_figure
 
         save_figure(selector.floor_plan(views), command.floor_plan)
         print(f"floor plan: {command.floor_plan}")

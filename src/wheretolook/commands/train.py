@@ -13,9 +13,15 @@ from wheretolook.dataset.dataset_lock import reading, reads_dataset
 from wheretolook.dataset.layout import Dataset
 from wheretolook.scorers.registry import Method
 from wheretolook.scorers.train_config import TrainConfig
-from wheretolook.tracking.runs import log as log_to_run
-from wheretolook.tracking.runs import log_history, start_run
-from wheretolook.tracking.store import TrackingConfig, check_store, kept_if_not_logged, warn_not_logged
+from wheretolook.tracking import (
+    TrackingConfig,
+    check_store,
+    kept_if_not_logged,
+    log_history,
+    start_run,
+    warn_not_logged,
+)
+from wheretolook.tracking import log as log_to_run
 from wheretolook.training.provenance import (
     HISTORY_CSV,
     NOT_LOGGED,

@@ -14,9 +14,6 @@ from wheretolook.geometry.poses import Float
 from wheretolook.scorers.adapted.calibration import log_losses
 from wheretolook.utils.texts import markdown_table
 
-RESAMPLES = 2000
-SQUARE_M = 1.0  # locations in one square of the floor of this side are resampled together
-
 Interval = tuple[float, float, float]  # value, lower and upper end of its 95 % interval
 
 
@@ -65,10 +62,11 @@ def compare_log_odds(
     """
     _, first, row, n_views = np.unique(location, return_index=True, return_inverse=True, return_counts=True)
     row = row.reshape(-1)
-    clusters = np.unique(np.floor(centers[first, :2] / SQUARE_M), axis=0, return_inverse=True)[1].reshape(-1)
+    # locations in the same square metre of floor are resampled together
+    clusters = np.unique(np.floor(centers[first, :2]), axis=0, return_inverse=True)[1].reshape(-1)
     if blocks is not None:
         clusters = np.where(blocks[first] >= 0, clusters.max() + 1 + blocks[first], clusters)
-    bootstrap = ClusterBootstrap(clusters, RESAMPLES, seed)
+    bootstrap = ClusterBootstrap(clusters, 2000, seed)
     has_choice = (n_views > 1).astype(np.float64)
     localizes_somewhere = np.bincount(row, weights=good) > 0
 

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -16,62 +15,26 @@ from wheretolook.dataset.layout import SceneFolder
 from wheretolook.dataset.viewpoint_table import by_first, has_first, is_good, poses
 from wheretolook.evaluation.config import EvaluateConfig, candidates_label
 from wheretolook.geometry.poses import Float, camera_centers
+from wheretolook.geometry.views import Views
 from wheretolook.utils.errors import TableError
 
 Ids = NDArray[np.int64]
 
 
-@dataclass(frozen=True, eq=False)
-class RankedViews:
-    """B labelled views at L locations to choose from.
-
-    Attributes:
-        location: (B,) number of each view's location, 0 .. L-1 over all scenes.
-        viewpoint_id: (B,) unique within a location.
-        good: (B, T) whether the view localizes within each of T thresholds; (B, 2 T) by both localizers.
-        location_scene: (L,) number of each location's scene.
-        location_block: (L,) block of neighbouring locations that are resampled together
-            (`wheretolook.evaluation.statistics.ClusterBootstrap`).
-    """
-
-    location: Ids
-    viewpoint_id: Ids
-    good: NDArray[np.bool_]
-    location_scene: Ids
-    location_block: Ids
-
-    @property
-    def n_locations(self) -> int:
-        """L."""
-        return len(self.location_scene)
-
-    def only(self, mask: NDArray[np.bool_]) -> RankedViews:
-        """Return the views where `mask` (B,) is set; locations are renumbered without empty ones, scenes are not."""
-        kept, location = np.unique(self.location[mask], return_inverse=True)
-        return RankedViews(
-            location, self.viewpoint_id[mask], self.good[mask], self.location_scene[kept], self.location_block[kept]
-        )
+def numbered(views: Views) -> Views:
+    """Number the locations of views: `waypoint` counts from 0 by scene and `location_id`, without gaps."""
+    key = views.scene * (views.location_id.max(initial=0) + 1) + views.location_id
+    return replace(views, waypoint=np.unique(key, return_inverse=True)[1])
 
 
-class SceneViews(NamedTuple):
-    """Labelled views of one scene: B views at L locations."""
-
-    location: Ids  # (B,) row of each view's location
-    viewpoint_id: Ids  # (B,)
-    good: NDArray[np.bool_]  # (B, T)
-    location_id: Ids  # (L,)
-    location_block: Ids  # (L,)
+def first_of_locations(views: Views) -> Views:
+    """Return one view of each location of `numbered` views, in their order, for what all views of a location share."""
+    return views[np.unique(views.waypoint, return_index=True)[1]]
 
 
-def join_scenes(parts: Sequence[SceneViews]) -> tuple[RankedViews, Ids]:
-    """Join views of scenes, numbered in this order; also returns the location_id (L,) of each location."""
-    sizes = [len(part.location_id) for part in parts]
-    starts = np.cumsum([0, *sizes])
-    locations, names, good, ids, blocks = zip(*parts, strict=True)
-    location = np.concatenate([rows + start for rows, start in zip(locations, starts, strict=False)])
-    scene = np.repeat(np.arange(len(parts)), sizes)
-    views = RankedViews(location, np.concatenate(names), np.concatenate(good), scene, np.concatenate(blocks))
-    return views, np.concatenate(ids)
+def n_locations(views: Views) -> int:
+    """Return how many locations `numbered` views have."""
+    return int(views.waypoint.max(initial=-1)) + 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,31 +50,31 @@ class TopN:
         return TopN(self.chosen[locations], self.good[locations], self.any_good[locations])
 
 
-def rank_views(views: RankedViews, scores: Float) -> Ids:
+def rank_views(views: Views, scores: Float) -> Ids:
     """Rank views within their locations by scores (B,): (B,) from 0, the highest; ties by rising viewpoint_id."""
-    order = np.lexsort((views.viewpoint_id, -scores, views.location))
-    location = views.location[order]
-    first = np.searchsorted(location, np.arange(views.n_locations))
+    order = np.lexsort((views.viewpoint_id, -scores, views.waypoint))
+    location = views.waypoint[order]
+    first = np.searchsorted(location, np.arange(n_locations(views)))
     ranks = np.empty(len(order), dtype=np.int64)
     ranks[order] = np.arange(len(order)) - first[location]
     return ranks
 
 
-def choose_best(views: RankedViews, ranks: Ids, n: int) -> TopN:
+def choose_best(views: Views, ranks: Ids, n: int) -> TopN:
     """Choose the n views of every location that rank first (`rank_views`), or all where there are fewer."""
     return _top(views, _sum_by_location(views, views.good & (ranks < n)[:, None]), n)
 
 
-def choose_oracle(views: RankedViews, n: int) -> TopN:
+def choose_oracle(views: Views, n: int) -> TopN:
     """Choose up to n good views of every location for each threshold: the oracle."""
     return _top(views, np.minimum(_sum_by_location(views, views.good), n), n)
 
 
-def _top(views: RankedViews, good: Float, n: int) -> TopN:
+def _top(views: Views, good: Float, n: int) -> TopN:
     return TopN(np.minimum(_n_views(views), n), good, (good > 0).astype(np.float64))
 
 
-def choose_at_random(views: RankedViews, n: int) -> TopN:
+def choose_at_random(views: Views, n: int) -> TopN:
     """Compute the exact expectation of choosing n views of every location uniformly, without replacement.
 
     With g good views of m, min(n, m) g / m of the chosen ones are good, and at least one is with probability
@@ -127,80 +90,72 @@ def choose_at_random(views: RankedViews, n: int) -> TopN:
     return TopN(chosen[:, 0], chosen * good / total, 1 - none)
 
 
-def _n_views(views: RankedViews) -> Float:
-    return np.bincount(views.location, minlength=views.n_locations).astype(np.float64)
+def _n_views(views: Views) -> Float:
+    return np.bincount(views.waypoint, minlength=n_locations(views)).astype(np.float64)
 
 
-def _sum_by_location(views: RankedViews, flags: NDArray[np.bool_]) -> Float:
-    columns = [np.bincount(views.location, weights=column, minlength=views.n_locations) for column in flags.T]
+def _sum_by_location(views: Views, flags: NDArray[np.bool_]) -> Float:
+    columns = [np.bincount(views.waypoint, weights=column, minlength=n_locations(views)) for column in flags.T]
     return np.stack(columns, axis=-1)
 
 
-@dataclass(frozen=True, eq=False)
-class CandidateSet:
-    """Views to choose from, under a name.
+def views_of(scenes: Sequence[SceneFolder], tables: Sequence[pd.DataFrame], config: EvaluateConfig) -> Views:
+    """Return all labelled views of scenes in the order of their tables, `numbered`.
 
-    Attributes:
-        name: as in the column `candidates`: "all", or such as "best 100".
-        mask: (B,) which of all labelled views belong to the set.
-        views: the views of the set.
-        location_id: (L,) ids of their locations, unique within a scene.
-    """
-
-    name: str
-    mask: NDArray[np.bool_]
-    views: RankedViews
-    location_id: Ids
-
-
-def views_of(
-    scenes: Sequence[SceneFolder], tables: Sequence[pd.DataFrame], config: EvaluateConfig
-) -> tuple[RankedViews, Ids]:
-    """Return all labelled views of scenes in the order of their tables, and the location_id (L,) of each location.
-
-    If all tables have labels by the first RANSAC result, too, these give a second half of the columns of `good`. Raises a
-    TableError if a table is empty, or a viewpoint has no label.
+    `good` (V, T) is whether a view localizes within each of T thresholds; if all tables have labels by the first RANSAC
+    result, too, (V, 2 T) by both. `block` is that of neighbouring locations, which are resampled together
+    (`wheretolook.evaluation.statistics.ClusterBootstrap`). Raises a TableError if a table is empty, or a viewpoint has no
+    label.
     """
     both = all(map(has_first, tables))
-    return join_scenes([_scene_views(scene, table, config, both) for scene, table in zip(scenes, tables, strict=True)])
+    parts = []
+    for number, (scene, table) in enumerate(zip(scenes, tables, strict=True)):
+        parts.append(_scene_views(number, scene, table, config, both))
+    return numbered(Views.concatenate(parts))
 
 
-def _scene_views(scene: SceneFolder, table: pd.DataFrame, config: EvaluateConfig, both: bool) -> SceneViews:
+def _scene_views(number: int, scene: SceneFolder, table: pd.DataFrame, config: EvaluateConfig, both: bool) -> Views:
     if table.empty:
         raise TableError("the table has no viewpoints", path=scene.table, fix="Run the sample stage again.")
     try:
-        labels = [table, *([by_first(table)] if both else [])]
-        good = np.stack([is_good(one, *limits) for one in labels for limits in config.thresholds], axis=-1)
+        good = []
+        for labelled in [table, by_first(table)] if both else [table]:
+            good += [is_good(labelled, max_m, max_deg) for max_m, max_deg in config.thresholds]
     except TableError as error:
         raise TableError(error.problem, path=scene.table, value=error.value, fix=error.fix) from None
-    ids, first, rows = np.unique(table["location_id"].to_numpy(np.int64), return_index=True, return_inverse=True)
-    block = np.arange(len(ids))
+    location_id = table["location_id"].to_numpy(np.int64)
+    cam_from_world = poses(table)
+    _, first, row = np.unique(location_id, return_index=True, return_inverse=True)
+    block = np.arange(len(first))
     if config.block_m:
-        floor = camera_centers(poses(table)[first])[:, :2]
+        floor = camera_centers(cam_from_world[first])[:, :2]
         squares = np.floor((floor - floor.min(0)) / config.block_m)
         block = np.unique(squares, axis=0, return_inverse=True)[1].reshape(-1)
-    return SceneViews(rows.reshape(-1), table["viewpoint_id"].to_numpy(np.int64), good, ids, block)
+    return Views(
+        cam_from_world,
+        scene=np.full(len(table), number),
+        location_id=location_id,
+        block=block[row.reshape(-1)],
+        viewpoint_id=table["viewpoint_id"].to_numpy(np.int64),
+        good=np.stack(good, axis=-1),
+    )
 
 
-def candidate_sets(
-    views: RankedViews,
-    location_id: Ids,
-    scenes: Sequence[SceneFolder],
-    tables: Sequence[pd.DataFrame],
-    config: EvaluateConfig,
-) -> list[CandidateSet]:
-    """Return the candidate sets of `config.candidates`, from views and location_id (L,) of `views_of`.
+def candidate_masks(
+    views: Views, scenes: Sequence[SceneFolder], tables: Sequence[pd.DataFrame], config: EvaluateConfig
+) -> dict[str, NDArray[np.bool_]]:
+    """Return which views of `views_of` belong to each set of `config.candidates`, (V,), by its name.
 
     Raises a TableError if all labels of a set are of one class.
     """
     rank = np.concatenate([table["visibility_rank"].to_numpy(np.int64) for table in tables])
-    sets = []
+    masks = {}
     for best in config.candidates:
         mask = rank < best if best else np.ones(len(rank), dtype=bool)
-        check_labels(views.good[mask, 0], candidates_label(best), scenes[0].table)
-        kept = np.unique(views.location[mask])
-        sets.append(CandidateSet(candidates_label(best), mask, views.only(mask), location_id[kept]))
-    return sets
+        name = candidates_label(best)
+        check_labels(views.good[mask, 0], name, scenes[0].table)
+        masks[name] = mask
+    return masks
 
 
 def check_labels(labels: NDArray[np.bool_], name: str, path: Path) -> None:

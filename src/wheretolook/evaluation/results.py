@@ -36,19 +36,20 @@ from wheretolook.dataset.layout import Dataset, SceneFolder
 from wheretolook.dataset.viewpoint_table import FIRST
 from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.evaluation.ranking import (
-    CandidateSet,
-    RankedViews,
     TopN,
     choose_at_random,
     choose_best,
     choose_oracle,
+    first_of_locations,
+    n_locations,
     rank_views,
 )
 from wheretolook.evaluation.statistics import ClusterBootstrap, divide, expected_calibration_error, scale_probability
 from wheretolook.geometry.poses import Float
+from wheretolook.geometry.views import Views
 from wheretolook.scorers.random import RandomScorer
 from wheretolook.scorers.registry import is_probability
-from wheretolook.tracking.runs import (
+from wheretolook.tracking import (
     ALL_METHODS,
     AUC,
     BEST_TAG,
@@ -56,6 +57,7 @@ from wheretolook.tracking.runs import (
     REGRET,
     SHARE,
     NestedRun,
+    TrackingConfig,
     artifact,
     fingerprint_of,
     joined,
@@ -65,7 +67,6 @@ from wheretolook.tracking.runs import (
     newest_run,
     start_run,
 )
-from wheretolook.tracking.store import TrackingConfig
 from wheretolook.utils.errors import check_choice
 from wheretolook.utils.files import fingerprint, temporary_folder
 from wheretolook.visibility.config import OcclusionConfig
@@ -77,7 +78,6 @@ PHOTOGRAPHS = "photographs"  # value of the column `candidates` in rows of held-
 RELEASED_DIVISOR = 0.527
 """Divisor of every share in the paper's released code, whatever the threshold, the scenes and N."""
 
-_PAIRED = ("difference", "difference_low", "difference_high", "p")
 _CALIBRATION = {"ece": np.nan, "ece_scaled": np.nan, "temperature": np.nan}  # columns where they are unknown
 
 Choices = Mapping[tuple[str, int], TopN]  # by method, the oracle included, and N
@@ -166,7 +166,7 @@ def signed_points(value: float) -> str:
     return f"{round(100 * value, 1) + 0.0:+.1f}"  # + 0.0 makes -0.0 positive
 
 
-def choose(views: RankedViews, scores: Mapping[str, Float], top_n: Sequence[int]) -> Choices:
+def choose(views: Views, scores: Mapping[str, Float], top_n: Sequence[int]) -> Choices:
     """Choose N views of every location by each method's scores (B,), and by the oracle."""
     choices: dict[tuple[str, int], TopN] = {}
     for method, values in scores.items():
@@ -195,7 +195,7 @@ def reference_method(methods: Iterable[str], name: str) -> str:
 
 
 def score_table(
-    views: RankedViews,
+    views: Views,
     scores: Mapping[str, Float],
     scenes: Sequence[str],
     config: EvaluateConfig,
@@ -223,15 +223,16 @@ def score_table(
     Raises:
         ConfigError: the reference is none of the methods.
     """
-    pools = [(ALL, np.ones(views.n_locations, dtype=bool))]
-    pools += [(name, views.location_scene == number) for number, name in enumerate(scenes)]
+    places = first_of_locations(views)
+    pools = [(ALL, np.ones(len(places), dtype=bool))]
+    pools += [(name, places.scene == number) for number, name in enumerate(scenes)]
     reference = reference_method(scores, config.reference)
     choices = choose(views, scores, config.top_n) if choices is None else choices
     rows: list[dict[str, object]] = []
     for name, locations in pools:
-        inside = locations[views.location]
-        strata = views.location_scene[locations]
-        bootstrap = ClusterBootstrap(views.location_block[locations], config.resamples, config.seed, strata)
+        inside = locations[views.waypoint]
+        strata = places.scene[locations]
+        bootstrap = ClusterBootstrap(places.block[locations], config.resamples, config.seed, strata)
         good = views.good[inside, 0]
         metrics = {}
         for method, values in scores.items():
@@ -270,7 +271,8 @@ def _share_columns(
     columns["released"] = columns["raw"] / RELEASED_DIVISOR
     add("regret", best - good, chosen)
     if not reference:
-        columns |= dict.fromkeys(_PAIRED, np.full(good.shape[1:], np.nan))
+        for name in ("difference", "difference_low", "difference_high", "p"):
+            columns[name] = np.full(good.shape[1:], np.nan)
     else:
         difference = good - tops[reference].good[:, None]
         add("difference", difference, chosen)
@@ -319,21 +321,12 @@ CALIBRATION_CSV = "calibration.csv"
 VARIANTS_CSV = "variants.csv"
 """In a release's `results/`: scores of the networks for all inputs, as `scores.csv`, before one was chosen to ship."""
 
-LOCATIONS_PARQUET = "locations.parquet"  # artifact of each nested run, see `location_table`
-
-_RUN_KEY = ("method", "occlusion", "candidates")  # one nested run for each combination
-_OF_ALL_VIEWS = ("n_locations", "average_precision", "roc_auc", "ece", "ece_scaled", "temperature")
-"""Columns of a score table that do not depend on N, logged once."""
-_OF_EACH_THRESHOLD = ("raw", "any", "normalized", "regret")
-_OF_FIRST_THRESHOLD = ("regret_low", "regret_high", "difference", "difference_low", "difference_high", "p")
-"""Columns that are logged for each N; `scores.csv`, an artifact, has all. Each metric costs MLflow 0.3 ms."""
-
 
 @dataclass(frozen=True, eq=False)
 class ScoredSet:
     """Scores, choices and score table of one candidate set by one occlusion model."""
 
-    candidates: CandidateSet
+    views: Views
     scores: Mapping[str, Float]  # (B,) by method
     choices: Choices
     table: pd.DataFrame  # with columns `occlusion` and `candidates`
@@ -346,7 +339,7 @@ class Evaluation:
 
     scenes: Sequence[SceneFolder]
     weights: Mapping[Path, str]  # files of weights, and the method that each serves
-    views: RankedViews  # all labelled views
+    views: Views  # all labelled views
     scored: Sequence[ScoredSet]  # for each occlusion model and candidate set
     table: pd.DataFrame  # their score tables, one below the other
     calibration: pd.DataFrame  # reliability curves of learned methods, see `calibration_rows`; empty without any
@@ -376,14 +369,18 @@ def runs_of_rows(table: pd.DataFrame, params: Mapping[str, Any]) -> Iterator[Nes
     result) and `top-1/apartment-210/regret_0.05m_0.4deg`.
     """
     keys = threshold_keys(table)
-    of_pooled = [f"{name}_{key}" for key in keys for name in _OF_EACH_THRESHOLD]
-    of_pooled += [f"{name}_{keys[0]}" for name in _OF_FIRST_THRESHOLD]
+    of_pooled = [f"{name}_{key}" for key in keys for name in ("raw", "any", "normalized", "regret")]
+    # not all columns, as each metric costs MLflow 0.3 ms; `scores.csv`, an artifact, has them
+    strictest = ("regret_low", "regret_high", "difference", "difference_low", "difference_high", "p")
+    of_pooled += [f"{name}_{keys[0]}" for name in strictest]
     of_pooled += [FIRST + name for name in of_pooled if FIRST + name in table]
-    for key, rows in table.groupby(list(_RUN_KEY), sort=False):
-        own = dict(zip(_RUN_KEY, map(str, key), strict=True))
+    names = ["method", "occlusion", "candidates"]
+    for key, rows in table.groupby(names, sort=False):
+        own = dict(zip(names, map(str, key), strict=True))
         pooled = rows[rows["scene"] == ALL]
         metrics = first_metrics(pooled)
-        metrics |= {name: float(pooled[name].iloc[0]) for name in _OF_ALL_VIEWS}
+        for name in ("n_locations", "average_precision", "roc_auc", "ece", "ece_scaled", "temperature"):
+            metrics[name] = float(pooled[name].iloc[0])  # the same for every N
         metrics |= _metrics_by_n(pooled, of_pooled) | _metrics_by_n(rows[rows["scene"] != ALL], [f"regret_{keys[0]}"])
         candidates = own["candidates"] if own["candidates"] != ALL else ""
         yield NestedRun(joined(own["method"], own["occlusion"], candidates), {**params, **own}, metrics)
@@ -437,17 +434,17 @@ def location_table(scored: ScoredSet, method: str, n: int, config: EvaluateConfi
     (whether one is; both are expectations for random choice), and best_score, the score of the first choice; NaN for
     random choice and the oracle.
     """
-    views = scored.candidates.views
+    places = first_of_locations(scored.views)
     top = scored.choices[method, n]
-    names = [scored.scenes[number].name for number in views.location_scene]
-    table = pd.DataFrame({"scene": names, "location_id": scored.candidates.location_id, "top_n": n})
+    names = [scored.scenes[number].name for number in places.scene]
+    table = pd.DataFrame({"scene": names, "location_id": places.location_id, "top_n": n})
     table["chosen"] = top.chosen.astype(np.int64)
     for index, key in enumerate(map(threshold_key, config.thresholds)):
         table[f"good_{key}"] = top.good[:, index]
         table[f"any_{key}"] = top.any_good[:, index]
-    best = np.full(views.n_locations, np.nan)
+    best = np.full(len(places), np.nan)
     if method in scored.scores and not is_random(method):
-        np.fmax.at(best, views.location, scored.scores[method])
+        np.fmax.at(best, scored.views.waypoint, scored.scores[method])
     return table.assign(best_score=best)
 
 
@@ -474,14 +471,14 @@ def log_evaluation(
     if logged_last(tracking, "evaluate", dataset.name, mark, SCORES_CSV) is not None:
         return
     best, metrics = best_of(evaluation.table)
-    metrics |= {"n_locations": views.n_locations, "n_views": len(views.good), "positives": views.good[:, 0].mean()}
+    metrics |= {"n_locations": n_locations(views), "n_views": len(views), "positives": views.good[:, 0].mean()}
     tags = {"dataset": dataset.name, FINGERPRINT_TAG: mark, **best}
     with temporary_folder() as folder, start_run(tracking, ALL_METHODS, "evaluate", params, tags=tags) as (client, run):
         log(client, run, metrics=metrics)
         for file in results.iterdir():
             if file.is_file() and file.suffix != ".partial":  # left by a killed process
                 client.log_artifact(run, str(file))
-        nested = _runs_with_locations(evaluation.scored, params, config, folder / LOCATIONS_PARQUET)
+        nested = _runs_with_locations(evaluation.scored, params, config, folder / "locations.parquet")
         log_nested(tracking, run, "evaluate", nested)
 
 

@@ -1,4 +1,4 @@
-"""Choose the weights of an evaluation, and score its views by all methods."""
+"""Score the labelled views of a split by every method and occlusion model, and compare the methods."""
 
 from __future__ import annotations
 
@@ -15,14 +15,16 @@ from tqdm.auto import tqdm
 
 from wheretolook.dataset.layout import Dataset, SceneFolder, views_by_camera
 from wheretolook.dataset.scene import Scene, SceneConfig
-from wheretolook.dataset.viewpoint_table import is_good, poses
+from wheretolook.dataset.viewpoint_table import UNLABELLED, is_good, poses
 from wheretolook.evaluation.config import EvaluateConfig
-from wheretolook.evaluation.ranking import CandidateSet, SceneViews, check_labels, join_scenes
-from wheretolook.evaluation.results import PHOTOGRAPHS, reference_method
+from wheretolook.evaluation.ranking import candidate_masks, check_labels, numbered, views_of
+from wheretolook.evaluation.results import PHOTOGRAPHS, Evaluation, ScoredSet, choose, reference_method, score_table
+from wheretolook.evaluation.statistics import calibration_rows, fit_temperature
 from wheretolook.geometry.poses import Float
+from wheretolook.geometry.views import Views
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.scorers.base import Scorer
-from wheretolook.scorers.registry import learned, make_scorer, members, methods_named, scorers
+from wheretolook.scorers.registry import is_probability, learned, make_scorer, members, methods_named, scorers
 from wheretolook.training.provenance import TrainedModel, was_trained_on, weights_path
 from wheretolook.training.weights import method_of_weights, read_training
 from wheretolook.utils.errors import TableError, WeightsError
@@ -30,10 +32,116 @@ from wheretolook.utils.files import fingerprint
 from wheretolook.utils.package import WEIGHTS, shipped
 from wheretolook.visibility.config import OcclusionConfig
 
-BATCH = 4096  # views binned and scored at a time
-BUNDLED = "that ships"  # follows the method's name in rows of bundled weights that are compared with others
 Weights = Mapping[Path, str]  # files of weights, and the method that each serves
-_SHARES_OF_THE_MAP = ("expected-inliers", "visible")  # methods whose score is a share of the map's landmarks
+
+
+def compare_methods(
+    dataset: Dataset,
+    config: EvaluateConfig,
+    models: Sequence[TrainedModel | Path] | None = None,
+    progress: bool = True,
+    device: str = "cpu",
+    occlusion: OcclusionConfig = OcclusionConfig(),
+    photographs: Sequence[HeldOutPhotographs] = (),
+) -> Evaluation:
+    """Score and compare all methods on the scenes of one split; see the evaluate command."""
+    scenes = dataset.split(config.split)
+    if not scenes:
+        fix = "Make one, or choose another split."
+        raise TableError(f"the dataset has no {config.split} scene", path=dataset.root, fix=fix)
+    weights = choose_weights(dataset, config, models)
+    if config.split == "test":
+        check_unseen(scenes, weights)
+    occlusions = [None if name is None else replace(occlusion, model=name) for name in config.occlusions or (None,)]
+    temperatures, n_val = _fit_temperatures(dataset, config, weights, device, progress, occlusions[0])
+    photographed = {one.scene.name for one in photographs}
+    rendered = [scene for scene in scenes if scene.name not in photographed or has_labels(scene)]
+    parts: list[ScoredSet] = []
+    scored: list[tuple[Views, Mapping[str, Float]]] = []  # of each occlusion model
+    if rendered:
+        tables = [scene.read_table() for scene in rendered]
+        views = views_of(rendered, tables, config)
+        masks = candidate_masks(views, rendered, tables, config)
+        for model in occlusions:
+            scores, used = score_scenes(rendered, tables, config, weights, device, progress, model)
+            scored.append((views, scores))
+            for name, mask in masks.items():
+                of_set = {method: values[mask] for method, values in scores.items()}
+                parts.append(_compare(name, numbered(views[mask]), of_set, rendered, used, config, temperatures))
+    if photographs:
+        views = photographs_views(photographs, config)
+        scores = score_photographs(photographs, config, weights, progress)
+        scored.append((views, scores))
+        used = " ".join(sorted({one.occlusion for one in photographs}))
+        of_views = [one.scene for one in photographs]
+        parts.append(_compare(PHOTOGRAPHS, views, scores, of_views, used, config, temperatures))
+    first_views, first_scores = scored[0]
+    table = pd.concat([part.table for part in parts], ignore_index=True)
+    calibration = _calibration(first_scores, first_views.good[:, 0], temperatures, n_val)
+    return Evaluation(scenes, weights, first_views, parts, table, calibration)
+
+
+def _compare(
+    name: str,
+    views: Views,
+    scores: Mapping[str, Float],
+    scenes: Sequence[SceneFolder],
+    occlusion: str,
+    config: EvaluateConfig,
+    temperatures: Mapping[str, float],
+) -> ScoredSet:
+    """Choose among the views of a candidate set by each method's scores (V,), and tabulate the results."""
+    choices = choose(views, scores, config.top_n)
+    table = score_table(views, scores, [scene.name for scene in scenes], config, temperatures, choices)
+    table.insert(1, "occlusion", occlusion)
+    table.insert(2, "candidates", name)
+    return ScoredSet(views, scores, choices, table, scenes)
+
+
+def has_labels(scene: SceneFolder) -> bool:
+    """Whether a scene has labelled views."""
+    return scene.table.is_file() and bool((scene.read_table()["status"] != UNLABELLED).any())
+
+
+def _fit_temperatures(
+    dataset: Dataset,
+    config: EvaluateConfig,
+    weights: Weights,
+    device: str,
+    progress: bool,
+    occlusion: OcclusionConfig | None,
+) -> tuple[dict[str, float], int]:
+    """Fit each learned method's temperature on the labelled views of the val scenes; also returns their number."""
+    if not weights or config.split == "val":  # fitted on the views it is judged by, it would be optimistic
+        return {}, 0
+    scenes = [scene for scene in dataset.split("val") if has_labels(scene)]
+    if not scenes:
+        return {}, 0
+    tables = [table[table["status"] != UNLABELLED] for table in (scene.read_table() for scene in scenes)]
+    chosen = methods_named(config.methods, scorers())
+    config = replace(config, methods=tuple(method.name for method in chosen if method.probability), reference="")
+    scores, _ = score_scenes(scenes, tables, config, weights, device, progress, occlusion)
+    good = np.concatenate([is_good(table, *config.thresholds[0]) for table in tables])
+    return {method: fit_temperature(values, good) for method, values in scores.items()}, len(good)
+
+
+def _calibration(
+    scores: Mapping[str, Float], good: NDArray[np.bool_], temperatures: Mapping[str, float], n_val: int
+) -> pd.DataFrame:
+    """Return the reliability curves of all learned methods over all labelled views; empty without any.
+
+    Columns: method, temperature, n_val (views that it was fitted on), then those of `calibration_rows`.
+    """
+    parts = []
+    for name, values in scores.items():
+        if is_probability(name):
+            temperature = temperatures.get(name, np.nan)
+            curves = calibration_rows(values, good, temperature)
+            curves.insert(0, "method", name)
+            curves.insert(1, "temperature", temperature)
+            curves.insert(2, "n_val", n_val)
+            parts.append(curves)
+    return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame()
 
 
 def choose_weights(dataset: Dataset, config: EvaluateConfig, models: Sequence[TrainedModel | Path] | None) -> Weights:
@@ -108,7 +216,7 @@ def score_scenes(
             localization_map = _open_map(scene, occlusion, device, progress)
             used.add(localization_map.occlusion.name)
             of_camera = cache(localization_map.of_camera)
-            batches = ((rows, of_camera(camera)) for camera, rows in views_by_camera(scene, table, BATCH))
+            batches = ((rows, of_camera(camera)) for camera, rows in views_by_camera(scene, table, at_most=4096))
             parts.append(score_batches(scene, poses(table), batches, config, weights, bar))
     return join_scores(parts), " ".join(sorted(used))
 
@@ -158,7 +266,8 @@ def score_batches(
 
 def score_scale(method: str, localization_map: LocalizationMap) -> int:
     """Return the factor that makes a method's scores comparable between maps of different sizes."""
-    return len(localization_map.landmarks) if method in _SHARES_OF_THE_MAP else 1
+    is_share_of_the_map = method in ("expected-inliers", "visible")
+    return len(localization_map.landmarks) if is_share_of_the_map else 1
 
 
 def join_scores(parts: Sequence[Mapping[str, Float]]) -> dict[str, Float]:
@@ -177,11 +286,12 @@ def scorers_of(
     for method in methods_named(config.methods, scorers()):
         paths = [path for path, kind in weights.items() if kind == method.weights]
         for path in paths if method.weights else [None]:
-            options = (config.seed, path, config.heading, anywhere or config.anywhere)
             # files of the same method are distinguished by their names
-            which = BUNDLED if path is not None and path.parent == shipped(WEIGHTS) else path
+            which = "that ships" if path is not None and path.parent == shipped(WEIGHTS) else path
             name = f"{method.name} {which}" if method.name in by_name else method.name
-            by_name[name] = make_scorer(method.name, localization_map, *options)
+            by_name[name] = make_scorer(
+                method.name, localization_map, config.seed, path, config.heading, anywhere or config.anywhere
+            )
     return by_name
 
 
@@ -208,22 +318,26 @@ class HeldOutPhotographs:
         return self.maps[0][1].occlusion.name
 
 
-def photographs_set(photographs: Sequence[HeldOutPhotographs], config: EvaluateConfig) -> CandidateSet:
-    """Return the photographs of scenes as candidates; views of a block at the same place are one location.
+def photographs_views(photographs: Sequence[HeldOutPhotographs], config: EvaluateConfig) -> Views:
+    """Return the photographs of scenes as `numbered` views; those of a block at the same place are one location.
 
     Locations with a single view count, although they leave no choice. Raises a TableError if all photographs have the
     same label.
     """
-    views, location_id = join_scenes([_scene_views(one.views, config) for one in photographs])
+    parts = []
+    for number, one in enumerate(photographs):
+        part = Views(
+            one.poses,
+            scene=np.full(len(one.views), number),
+            location_id=one.views["place"].to_numpy(np.int64),
+            block=one.views["block"].to_numpy(np.int64),
+            viewpoint_id=one.views["photograph"].to_numpy(np.int64),
+            good=np.stack([is_good(one.views, max_m, max_deg) for max_m, max_deg in config.thresholds], axis=-1),
+        )
+        parts.append(part)
+    views = Views.concatenate(parts)
     check_labels(views.good[:, 0], PHOTOGRAPHS, photographs[0].scene.map)
-    return CandidateSet(PHOTOGRAPHS, np.ones(len(views.good), dtype=bool), views, location_id)
-
-
-def _scene_views(views: pd.DataFrame, config: EvaluateConfig) -> SceneViews:
-    ids, first, rows = np.unique(views["place"].to_numpy(np.int64), return_index=True, return_inverse=True)
-    good = np.stack([is_good(views, *limits) for limits in config.thresholds], axis=-1)
-    names = views["photograph"].to_numpy(np.int64)
-    return SceneViews(rows.reshape(-1), names, good, ids, views["block"].to_numpy(np.int64)[first])
+    return numbered(views)
 
 
 def score_photographs(

@@ -15,8 +15,6 @@ from scipy.special import expit
 from wheretolook.geometry.poses import Float
 from wheretolook.scorers.adapted.calibration import finite_log_odds
 
-_PERCENTILES = (2.5, 97.5)  # ends of a 95 % interval
-
 
 class ClusterBootstrap:
     """Draws clusters with replacement within each stratum; the draws serve all methods, so differences are paired.
@@ -84,7 +82,7 @@ class ClusterBootstrap:
             values = np.full_like(values, np.nan)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", RuntimeWarning)  # of columns that are all NaN
-            low, high = np.nanpercentile(values[1:], _PERCENTILES, axis=0)
+            low, high = np.nanpercentile(values[1:], (2.5, 97.5), axis=0)
         return low, high
 
     def ratio_interval(self, numerator: Float, denominator: Float) -> tuple[Float, Float]:
@@ -120,7 +118,6 @@ def divide(numerator: Float, denominator: Float | float) -> Float:
 Labels = NDArray[np.bool_]  # (B,) whether each view localizes
 BINS = 15  # bins of equal width
 MARGIN = 1e-15  # probabilities are clipped to this distance from 0 and 1
-TEMPERATURES = (0.01, 100.0)  # range of temperatures
 
 
 def bins_of(probability: Float, bins: int = BINS) -> NDArray[np.int64]:
@@ -183,7 +180,7 @@ def negative_log_likelihood(probability: Float, good: Labels) -> float:
 
 
 def fit_temperature(probability: Float, good: Labels) -> float:
-    """Fit the temperature in `TEMPERATURES` that maximizes the likelihood of labels (B,) (Guo et al., ICML 2017).
+    """Fit the temperature of 0.01 to 100 that maximizes the likelihood of labels (B,) (Guo et al., ICML 2017).
 
     It is above 1 for an overconfident network, below 1 for an underconfident one; NaN where all labels are of one class.
     """
@@ -194,7 +191,7 @@ def fit_temperature(probability: Float, good: Labels) -> float:
     def loss(log_t: float) -> float:
         return _mean_loss(logits / np.exp(log_t), good)
 
-    best = minimize_scalar(loss, bounds=np.log(TEMPERATURES), method="bounded", options={"xatol": 1e-6})
+    best = minimize_scalar(loss, bounds=np.log((0.01, 100.0)), method="bounded", options={"xatol": 1e-6})
     return float(np.exp(best.x))
 
 

@@ -1,9 +1,12 @@
-"""Floor plan of a map's landmarks and of views, from straight above."""
+"""Figures: floor plans with views, images with matches, and the style and files of all figures."""
 
 from __future__ import annotations
 
+import io
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -11,13 +14,78 @@ from matplotlib.figure import Figure
 from matplotlib.style import context
 from numpy.typing import NDArray
 
-from wheretolook.figures.style import BLUE, GREY, INK, RC, VERMILION, frame, new_figure
+from wheretolook.figures import KINDS
 from wheretolook.geometry.poses import Float
+from wheretolook.utils.errors import ConfigError
+from wheretolook.utils.files import write_bytes
 
-MAX_LANDMARKS = 30_000  # drawn
-MAX_NAMES = 30  # with more locations, none is named
-OUTLIERS = 0.01  # share of the landmarks left out at each end
-ARROW = 0.06  # length over that of the plan
+INK = "#333333"
+GREY = "#7a7a7a"
+BLUE = "#0072B2"
+VERMILION = "#D55E00"
+"""Colours; the last two of the colour-blind-safe palette of Okabe and Ito (2008)."""
+
+RC: dict[str, Any] = {
+    "axes.edgecolor": INK,
+    "axes.labelcolor": INK,
+    "text.color": INK,
+    "xtick.color": INK,
+    "ytick.color": INK,
+    "grid.color": "#d9d9d9",
+    "font.size": 10,
+    "axes.titlesize": 11,
+    "axes.labelsize": 10,
+    "legend.fontsize": 9,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.linewidth": 0.6,
+    "lines.linewidth": 1.6,
+    "hatch.linewidth": 0.7,
+    "legend.frameon": False,
+    "figure.dpi": 100,
+    "savefig.dpi": 160,
+    "savefig.bbox": "tight",
+    "svg.hashsalt": "wheretolook",
+    "svg.fonttype": "none",
+    "pdf.fonttype": 42,
+}
+"""Matplotlib parameters of figures on screen."""
+
+
+def new_figure(width_in: float, height_in: float) -> Figure:
+    """Create an empty figure independent of pyplot. Draw into it within `with context(RC):`."""
+    with context(RC):
+        return Figure(figsize=(width_in, height_in), layout="constrained")
+
+
+def frame(axes: Axes, color: str = INK, linewidth: float = 0.5) -> None:
+    """Draw a frame around the axes of an image, without ticks and grid."""
+    axes.set(xticks=[], yticks=[])
+    axes.grid(False)
+    axes.spines[:].set(visible=True, linewidth=linewidth, color=color)
+
+
+def save_figure(figure: Figure, path: Path, note: str = "") -> None:
+    """Write a figure to `path` (.png, .pdf or .svg) atomically; equal figures give equal bytes.
+
+    `note`, such as the runs that the figure shows, is stored in the file's metadata. Raises ConfigError for another
+    format.
+    """
+    kind = path.suffix[1:].lower()
+    if kind not in KINDS:
+        raise ConfigError("unsupported figure format", path=path, fix=f"Use {', '.join(KINDS)}.")
+    # The field of a file's metadata that holds the note, and fields without dates and versions.
+    field, metadata = {
+        "png": ("Description", {"Software": None}),
+        "pdf": ("Subject", {"CreationDate": None, "Creator": None}),
+        "svg": ("Description", {"Date": None}),
+    }[kind]
+    buffer = io.BytesIO()  # the PDF writer does not report the cause of a failed write
+    with context(RC):
+        figure.savefig(buffer, format=kind, metadata=metadata | ({field: note} if note else {}))
+    write_bytes(path, buffer.getvalue())
 
 
 def floor_plan_figure(landmarks: Float, positions: Float, axes: Float, scores: Float, names: Sequence[str]) -> Figure:
@@ -39,8 +107,8 @@ def draw_floor_plan(
     """Draw what `floor_plan_figure` takes, with a colour bar of the given label."""
     low, high = _extent(landmarks, positions)
     inside = landmarks[((landmarks[:, :2] >= low) & (landmarks[:, :2] <= high)).all(axis=1)]
-    drawn = inside[:: len(inside) // MAX_LANDMARKS + 1]
-    arrows = ARROW * float(np.linalg.norm(high - low)) * axes[:, :2]
+    drawn = inside[:: len(inside) // 30_000 + 1]
+    arrows = 0.06 * float(np.linalg.norm(high - low)) * axes[:, :2]
     order = np.argsort(scores, kind="stable")  # the best on top
     plan.scatter(drawn[:, 0], drawn[:, 1], s=1.5, color=GREY, alpha=0.4, linewidths=0, label="landmarks")
     shown = plan.quiver(
@@ -56,21 +124,17 @@ def draw_floor_plan(
     )
     plan.plot(*positions[:, :2].T, "o", color=INK, markersize=3)
     places = dict(zip(names, positions[:, :2], strict=True))
-    for name, place in places.items() if len(places) <= MAX_NAMES else ():
-        plan.annotate(name, place, (3, 3), textcoords="offset points", fontsize=8)
+    if len(places) <= 30:  # names of more would hide each other
+        for name, place in places.items():
+            plan.annotate(name, place, (3, 3), textcoords="offset points", fontsize=8)
     plan.set(xlabel="x, map unit", ylabel="y, map unit", aspect="equal")
     plan.figure.colorbar(shown, ax=plan, shrink=0.7, label=label)
 
 
 def _extent(landmarks: Float, positions: Float) -> tuple[Float, Float]:
     """Return the lowest and highest x and y, (2,) each, of the plan."""
-    low, high = np.quantile(landmarks[:, :2], (OUTLIERS, 1 - OUTLIERS), axis=0)
+    low, high = np.quantile(landmarks[:, :2], (0.01, 0.99), axis=0)
     return np.minimum(low, positions[:, :2].min(axis=0)), np.maximum(high, positions[:, :2].max(axis=0))
-
-
-HEIGHT_IN = 5.0
-PLAN_IN = 6.5
-COLUMNS = 2  # of images
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,12 +155,13 @@ def localization_figure(
 
     `positions` and unit optical `axes` (1 + R, 3) are of the first image; z is up. Without a pose there are none.
     """
-    columns = min(len(images), COLUMNS)
+    columns = min(len(images), 2)
     rows = -(-len(images) // columns)
-    widths = [HEIGHT_IN / rows * image.rgb.shape[1] / image.rgb.shape[0] for image in images[:columns]]
-    widths += [PLAN_IN] if len(positions) else []
+    height_in = 5.0
+    widths = [height_in / rows * image.rgb.shape[1] / image.rgb.shape[0] for image in images[:columns]]
+    widths += [6.5] if len(positions) else []
     with context(RC):
-        figure = new_figure(sum(widths), HEIGHT_IN + 0.6 * rows)
+        figure = new_figure(sum(widths), height_in + 0.6 * rows)
         grid = figure.add_gridspec(rows, len(widths), width_ratios=widths)
         for n, image in enumerate(images):
             panel = figure.add_subplot(grid[divmod(n, columns)])

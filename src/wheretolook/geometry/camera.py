@@ -22,8 +22,6 @@ if TYPE_CHECKING:
 
 MAX_SIDE_PX = 10**6  # of an image; COLMAP's limit is not much higher
 MAX_PX = 1e12  # of a focal length or a principal point, whose products stay finite; and no integers without end
-PINHOLES = {"SIMPLE_PINHOLE": 1, "PINHOLE": 2}  # number of focal lengths of COLMAP's pinholes
-MAX_RAY_ERROR = 1e-4  # largest distance between a point's direction and its pixel's ray (chord, about radians)
 
 
 class _Image:
@@ -171,7 +169,7 @@ class ColmapCamera(_Image):
     params: tuple[float, ...]  # intrinsics in COLMAP's order for the model
 
     def __post_init__(self) -> None:
-        focal_lengths = PINHOLES.get(self.model)
+        focal_lengths = {"SIMPLE_PINHOLE": 1, "PINHOLE": 2}.get(self.model)
         if focal_lengths and len(self.params) == focal_lengths + 2 and np.isfinite(self.params).all():
             _check_intrinsics(self.width, self.height, self.params[:focal_lengths])
             return  # a robot has no COLMAP
@@ -233,7 +231,7 @@ class ColmapCamera(_Image):
             rows = np.flatnonzero(self.in_image(pixels))
             length = np.linalg.norm(flat[rows], axis=1, keepdims=True)
             miss = np.linalg.norm(flat[rows] / length - self.unproject(pixels[rows]), axis=1)
-        pixels[rows[~(miss <= MAX_RAY_ERROR)]] = np.nan
+        pixels[rows[~(miss <= 1e-4)]] = np.nan  # chord, about radians
         return pixels.reshape(*points.shape[:-1], 2)
 
     def unproject(self, pixels: ArrayLike) -> Float:
@@ -417,16 +415,14 @@ def field_of_view_deg(camera: Camera) -> tuple[float, float]:
     return float(angles[0] + angles[1]), float(angles[2] + angles[3])
 
 
-PROPORTIONS = ((4, 3), (3, 2), (16, 9), (1, 1), (3, 4), (2, 3), (9, 16))  # of drawn cameras
-
-
 def draw_camera(rng: np.random.Generator) -> PinholeCamera:
     """Draw a common pinhole: 40 to 120 degrees along the longer side, 320 to 1,280 px wide or high.
 
     Sides are 4:3, 3:2, 16:9 or 1:1, also upright; the principal point is off the centre by up to 5 % of a side.
     """
     longer = np.exp(rng.uniform(*np.log((320, 1280))))
-    a, b = PROPORTIONS[rng.integers(len(PROPORTIONS))]
+    proportions = ((4, 3), (3, 2), (16, 9), (1, 1), (3, 4), (2, 3), (9, 16))
+    a, b = proportions[rng.integers(len(proportions))]
     width, height = (2 * round(longer * side / max(a, b) / 2) for side in (a, b))
     across = rng.uniform(40.0, 120.0)
     focal_px = round(max(width, height) / 2 / np.tan(np.radians(across) / 2), 2)

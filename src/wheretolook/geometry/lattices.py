@@ -15,9 +15,6 @@ from wheretolook.utils.devices import fitting
 from wheretolook.utils.errors import ConfigError, check_choice
 
 GOLDEN_ANGLE = np.pi * (1 + np.sqrt(5))  # radians between neighbours of the spiral: the paper's i * pi * (1 + sqrt 5)
-BYTES_PER_VOXEL = 160  # while the locations of a grid are computed, and which of them are free
-BYTES_PER_DIRECTION = 500  # while rotations and views are made of it
-MOST_VOXELS = 2**31 - 1  # tables hold ids of locations in 32 bits
 Lattice = Literal["fibonacci", "azimuth-elevation", "released", "yaw-pitch"]
 
 
@@ -73,7 +70,8 @@ def check_voxels(shape: tuple[int, int, int]) -> None:
     if min(shape) < 1:
         raise ConfigError("a grid needs at least one voxel along every axis", value=shape)
     voxels = math.prod(shape)
-    most = min(fitting(BYTES_PER_VOXEL), MOST_VOXELS)
+    # a voxel takes 160 bytes while its location and whether it is free are computed; tables hold ids in 32 bits
+    most = min(fitting(160), 2**31 - 1)
     if voxels <= most:
         return
     fix = f"There is room for {most:,} voxels."
@@ -185,7 +183,7 @@ LATTICES: dict[str, Callable[[int], Float]] = {
 def _positive(n: int) -> int:
     if n < 1:
         raise ConfigError("a lattice needs at least one direction", value=n)
-    if n > (most := fitting(BYTES_PER_DIRECTION)):
+    if n > (most := fitting(500)):  # bytes of a direction while rotations and views are made of it
         fix = f"There is room for {most:,}."
         raise ConfigError("so many directions do not fit into memory", value=n, fix=fix)
     return n

@@ -27,14 +27,9 @@ FORMATS = (
     '"id x y z", a TUM trajectory "t x y z qx qy qz qw", COLMAP\'s images.txt, or "x y z"; lines that start with # are comments'
 )
 NAME_COLUMNS = ("image", "id", "waypoint", "name", "t", "timestamp")
-_TUM_COLUMNS = ("t", *"xyz", "qx", "qy", "qz", "qw")
 _TUM_ORDER = (*TRANSLATION_COLUMNS, "qx", "qy", "qz", "qw")
 _IMAGE_COLUMNS = ("image_id", *POSE_COLUMNS, "camera_id", "name")
-_FIXED_COLUMNS = {len(columns): columns for columns in (tuple("xyz"), ("id", *"xyz"), _TUM_COLUMNS, _IMAGE_COLUMNS)}
 MAX_ROWS = 500_000  # of a text table
-MAX_IMAGES_BYTES = 100_000_000  # of an images.txt, which also has the keypoints
-UNIT_TOLERANCE = 0.01  # of a quaternion's length
-FAR_M = 1000.0  # of a camera from the origin, from where on its quaternion needs more decimals
 
 
 def pose_values(cam_from_world: ArrayLike) -> Float:
@@ -118,14 +113,16 @@ def read_named_rows(path: str | Path) -> NamedRows:
     path = Path(path)
     may_be_images = path.suffix == ".txt"
     try:  # once, since it may be a pipe
-        text = read_text(path, MAX_IMAGES_BYTES if may_be_images else MAX_TEXT_BYTES, pipes=True)
+        max_bytes = 100_000_000 if may_be_images else MAX_TEXT_BYTES  # an images.txt has the keypoints, too
+        text = read_text(path, max_bytes, pipes=True)
     except (OSError, ValueError) as error:
         raise TableError(f"the file cannot be read: {error}", path=path, fix="Give a text file of rows.") from error
     rows = _image_rows(text) if may_be_images else []
     if not rows or len(rows[0][1]) < len(_IMAGE_COLUMNS):
         rows = read_rows(path, text)
     first = rows[0][1]
-    names = _FIXED_COLUMNS.get(len(first), ())
+    fixed = (tuple("xyz"), ("id", *"xyz"), ("t", *"xyz", "qx", "qy", "qz", "qw"), _IMAGE_COLUMNS)
+    names = next((columns for columns in fixed if len(columns) == len(first)), ())
     if len(first) > 1 and not any(map(_is_number, first)):
         names = tuple(cell.strip("\"' ").lower() for cell in first)
         rows = rows[1:]
@@ -146,7 +143,7 @@ def poses_of_rows(table: NamedRows, orientations_only: bool = False) -> Float:
     path = table.path
     quaternions = table.numbers(QUATERNION_COLUMNS)
     lengths = np.linalg.norm(quaternions, axis=1)
-    for row in np.flatnonzero(np.abs(lengths - 1) > UNIT_TOLERANCE).tolist():
+    for row in np.flatnonzero(np.abs(lengths - 1) > 0.01).tolist():
         value = f"line {table.rows[row][0]}: {lengths[row]:.4g}"
         raise TableError("a quaternion is not of length 1", path=path, value=value, fix="Correct the order of columns.")
     locations: Float = np.zeros((len(quaternions), 3))
@@ -193,7 +190,7 @@ def pose_texts(cam_from_world: ArrayLike, exact: bool = False) -> list[str]:
     Far from the origin quaternions get 15 decimals, since the camera's centre follows from them and the translation.
     """
     values = pose_values(cam_from_world)
-    decimals = 9 if np.abs(values[:, 4:]).max(initial=0) < FAR_M else 15
+    decimals = 9 if np.abs(values[:, 4:]).max(initial=0) < 1000.0 else 15
     pattern = ["{!r}"] * 7 if exact else [f"{{:.{decimals}f}}"] * 4 + ["{:.9f}"] * 3
     return [" ".join(pattern).format(*row) for row in values.tolist()]
 

@@ -46,8 +46,6 @@ SIGNS = np.array([
 ])  # fmt: skip
 """Index of the number at each place of an information matrix, and its sign; 0 where none is."""
 
-_UPPER = np.triu_indices(3)
-
 
 def bearing_numbers(offsets: ArrayLike) -> Float:
     """Each landmark's information as 15 numbers (..., 15), in the precision of the offsets.
@@ -58,7 +56,8 @@ def bearing_numbers(offsets: ArrayLike) -> Float:
     distance = np.linalg.norm(offsets, axis=-1, keepdims=True)
     bearing = offsets / distance
     across = np.eye(3, dtype=offsets.dtype) - bearing[..., :, None] * bearing[..., None, :]
-    numbers = across[..., _UPPER[0], _UPPER[1]]
+    row, column = np.triu_indices(3)
+    numbers = across[..., row, column]
     return np.concatenate([numbers / distance**2, bearing / distance, numbers], axis=-1)
 
 

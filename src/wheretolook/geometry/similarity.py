@@ -46,15 +46,12 @@ class Similarity:
         model.transform(pycolmap.Sim3d(self.scale, pycolmap.Rotation3d(self.rotation), self.translation))
 
 
-STEP_M = 100.0
-
-
 def local_origin(points: ArrayLike) -> Float:
     """Whole hundreds of metres near the median of the finite ones of points (N, 3) m, (3,): 0 for most scenes."""
     at = np.asarray(points, dtype=np.float64).reshape(-1, 3)
     at = at[np.isfinite(at).all(1)]
     center = np.median(at, axis=0) if len(at) else np.zeros(3)
-    return np.asarray(np.round(center / STEP_M) * STEP_M + 0.0)  # no -0.0
+    return np.asarray(np.round(center / 100.0) * 100.0 + 0.0)  # no -0.0
 
 
 def poses_from(cam_from_world: ArrayLike, origin: ArrayLike) -> Float:

@@ -15,9 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from wheretolook.geometry.camera import Camera, write_cameras
-from wheretolook.geometry.camera_turns import pan_tilt_angles
 from wheretolook.geometry.pose_files import images_text, pose_texts, poses_of_rows, read_named_rows, tum_text
-from wheretolook.geometry.poses import Float, camera_centers, quaternion_from_rotation
+from wheretolook.geometry.poses import Float, camera_centers, pan_tilt_angles, quaternion_from_rotation
 from wheretolook.utils.errors import ConfigError, StorageError, check_choice
 from wheretolook.utils.files import check_output_folder, write_json, write_text
 
@@ -86,6 +85,15 @@ class Views:
     n_too_far: Column = None
     n_too_oblique: Column = None
     n_repeated: Column = None
+    # (V,) of labelled views: number of the scene, ids of location and viewpoint, and block of neighbouring locations
+    scene: Column = None
+    location_id: Column = None
+    viewpoint_id: Column = None
+    block: Column = None
+    good: Column = None  # (V,) whether the view localizes, or (V, T) within each of T thresholds
+    direction_id: Column = None  # (V,) row of the direction in a lattice, -1 where there is no view
+    pixels: Column = None  # V arrays (K, 2) of the landmarks in view
+    images: Column = None  # (V, H, W, 3) uint8
 
     def __len__(self) -> int:
         return len(self.cam_from_world)

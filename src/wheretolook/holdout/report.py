@@ -18,7 +18,7 @@ from scipy.sparse.csgraph import connected_components
 
 from wheretolook.dataset.config import ACCURACY, Accuracy
 from wheretolook.evaluation.statistics import reliability
-from wheretolook.figures.style import BLUE, INK, RC, VERMILION, new_figure
+from wheretolook.figures.floor_plan import BLUE, INK, RC, VERMILION, new_figure
 from wheretolook.geometry.poses import Float
 from wheretolook.holdout.holdout import VIEWS, HoldoutResult, choose_blocks, hold_out_blocks, judged
 from wheretolook.holdout.metrics import measure

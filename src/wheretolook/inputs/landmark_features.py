@@ -157,6 +157,7 @@ class ReasonCounter:
     """Counts the landmarks of a map that are hard to match in views of it, by reason."""
 
     def __init__(self, localization_map: LocalizationMap) -> None:
+        self.localization_map = localization_map
         hidden = not isinstance(localization_map.occlusion, NoOcclusion)
         self._unoccluded = replace(localization_map, occlusion=NoOcclusion()) if hidden else None
         self._describer = LandmarkDescriber(localization_map, ("distance_ratio", "mapped_angle", "ambiguity"))

@@ -12,9 +12,8 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
-from wheretolook.geometry.camera_turns import pan_tilt_angles, within
 from wheretolook.geometry.lattices import direction_lattice
-from wheretolook.geometry.poses import Float, camera_centers, rotation_looking_along
+from wheretolook.geometry.poses import Float, camera_centers, pan_tilt_angles, rotation_looking_along, within
 from wheretolook.localization.confidence import RIGHT_PLACE, probabilities
 from wheretolook.utils.errors import PlanningError
 
@@ -32,15 +31,9 @@ class DirectionScorer(Protocol):
 
 
 N_DIRECTIONS = 300
-FULL_SPREAD_DEG = 90.0
-"""Angle to all earlier views from which on a view sees nothing that they have seen."""
 
 MIN_ANGLE_DEG = 30.0
 """Minimum angle to all earlier views."""
-
-MAX_HYPOTHESES = 6
-MIN_PROBABILITY = 0.02  # of a hypothesis that is considered
-SAMPLED_LOCATIONS = 40  # mapping cameras at which the mean score of each pitch is determined
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +56,7 @@ class NextLook:
 def mean_scores_by_pitch(scorer: Scorer, locations: ArrayLike | None = None) -> Float:
     """Determine mean scores (N_DIRECTIONS,) of views at locations (L, 3) m, from the lowest pitch of the lattice up.
 
-    Locations are by default those of mapping cameras. Raises PlanningError if neither are known.
+    Locations are by default those of 40 mapping cameras at most. Raises PlanningError if neither are known.
     """
     if locations is None:
         poses = scorer.localization_map.mapping_poses
@@ -71,7 +64,7 @@ def mean_scores_by_pitch(scorer: Scorer, locations: ArrayLike | None = None) -> 
             raise PlanningError("the map has no mapping cameras", fix="Give locations.")
         locations = camera_centers(poses)
     at: Float = np.asarray(locations, dtype=np.float64)
-    at = at[np.linspace(0, len(at) - 1, min(len(at), SAMPLED_LOCATIONS)).astype(int)]
+    at = at[np.linspace(0, len(at) - 1, min(len(at), 40)).astype(int)]
     axes = direction_lattice(N_DIRECTIONS)
     window = np.ones(N_DIRECTIONS // 10)
     mean = np.convolve(scorer.score_directions(at, axes).mean(axis=0)[np.argsort(axes[:, 2])], window, mode="same")
@@ -83,7 +76,7 @@ class NextLookSelector:
 
     The gain of a view is the sum over hypotheses of the probability of each times the view's score if it is right. With
     the probability that all are wrong, the gain is the mean score over the map of views at this pitch, times the angle to
-    the nearest earlier view as a fraction of `FULL_SPREAD_DEG`.
+    the nearest earlier view as a fraction of 90 degrees.
     """
 
     def __init__(self, scorer: DirectionScorer, mean_scores: Float) -> None:
@@ -99,11 +92,11 @@ class NextLookSelector:
         return found @ scores + (1 - found.sum()) * self.scores_if_lost(localization, axes, heights)
 
     def scores_under(self, localization: JointLocalization, axes: Float) -> tuple[Float, Float]:
-        """Probabilities (H,) of the best hypotheses, and under each the scores (H, D) of axes (D, 3) in the rig."""
+        """Probabilities (H,), at least 0.02, of the best 6 hypotheses at most, and under each the scores (H, D) of axes (D, 3) in the rig."""
         poses = (localization, *localization.rivals)
         found = probabilities(localization, RIGHT_PLACE)
-        best = np.argsort(-found, kind="stable")[:MAX_HYPOTHESES]
-        best = best[found[best] >= MIN_PROBABILITY]
+        best = np.argsort(-found, kind="stable")[:6]
+        best = best[found[best] >= 0.02]
         scores = np.zeros((len(best), len(axes)))
         for row, k in enumerate(best):
             pose = np.asarray(poses[k].rig_from_world)
@@ -112,7 +105,8 @@ class NextLookSelector:
 
     def scores_if_lost(self, localization: JointLocalization, axes: Float, heights: Float) -> Float:
         """Scores (D,) of views as of `gains` if no hypothesis is right."""
-        spread = np.minimum(angles_to_views(localization, axes) / FULL_SPREAD_DEG, 1)
+        # from 90 degrees on, a view sees nothing that earlier ones have seen
+        spread = np.minimum(angles_to_views(localization, axes) / 90.0, 1)
         return np.interp(heights, self._heights, self._mean_scores) * spread
 
     def select(

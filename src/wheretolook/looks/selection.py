@@ -15,26 +15,28 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from wheretolook.geometry.camera_turns import TOLERANCE_DEG
-from wheretolook.geometry.pose_information import N_NUMBERS, PRIOR, bearing_numbers, information_matrices
-from wheretolook.geometry.poses import Float, poses_looking_along, rotation_angle_deg, rotation_looking_along
+from wheretolook.geometry.pose_information import PRIOR, bearing_numbers, information_matrices
+from wheretolook.geometry.poses import (
+    TOLERANCE_DEG,
+    Float,
+    poses_looking_along,
+    rotation_angle_deg,
+    rotation_looking_along,
+)
 from wheretolook.localization.confidence import LogisticRegression
+from wheretolook.scorers.registry import find
 from wheretolook.utils.errors import ConfigError, PlanningError
 
 if TYPE_CHECKING:
     from wheretolook.scorers.base import Scorer
 
 
-N_SUMS = 1 + N_NUMBERS  # landmarks expected to be detected, and their information on the pose
-MAX_ENTRIES = 12_000  # visible landmarks of all views that are described; of more, an even share represents all
-
-
 @dataclass(frozen=True, eq=False)
-class CandidateViews:
+class Detections:
     """What each of D views from one location detects of U landmarks."""
 
     p_detect: NDArray[np.float32]  # (D, U) probability that the view detects the landmark; 0 where it is not visible
-    terms: Float  # (U, N_SUMS) float64, what a detected landmark adds to the sums
+    terms: Float  # (U, 16) float64, what a detected landmark adds to the sums: one, and its information on the pose
     n_visible: NDArray[np.int64]  # (D,) visible landmarks
     p_single: Float  # (D,) probability that the view localizes on its own; 0 where it is unknown
 
@@ -42,7 +44,7 @@ class CandidateViews:
         return len(self.p_detect)
 
     def sums_with_each(self, views: Sequence[int] = ()) -> Float:
-        """Return the sums (D, N_SUMS) of a set of views with each view added, in single precision."""
+        """Return the sums (D, 16) of a set of views with each view added, in single precision."""
         left = self.terms
         if len(views):
             left = self.p_missed(views).astype(np.float64)[:, None] * self.terms
@@ -57,19 +59,18 @@ class CandidateViews:
         return float(np.prod(1 - self.p_single[np.asarray(views, dtype=np.int64)]))
 
     def joint_sums(self, views: Sequence[int]) -> Float:
-        """Return the sums (N_SUMS,) of a set of views, in double precision."""
+        """Return the sums (16,) of a set of views, in double precision."""
         return np.asarray((1 - self.p_missed(views).astype(np.float64)) @ self.terms)
 
 
 def candidate_views(
     scorer: Scorer, location: Float, directions: Float, scores: Float | None = None, certain: bool = False
-) -> CandidateViews:
+) -> Detections:
     """Describe what views along directions (D, 3) from a location (3,) m detect.
 
     `scores` (D,) of the scorer are the views' probabilities of localizing, if its method predicts those. Where the
     scorer knows no landmark probabilities, and if `certain`, every visible landmark is detected with equal precision.
     """
-    from wheretolook.scorers.registry import find
     from wheretolook.visibility.frustum import LandmarkSets
 
     location = np.asarray(location, dtype=np.float64)
@@ -79,7 +80,8 @@ def candidate_views(
     n_visible = np.diff(starts)
     rows = indices.cpu().numpy().astype(np.int64)
     view = np.repeat(np.arange(len(poses)), n_visible)
-    stride = max(1, -(-len(rows) // MAX_ENTRIES))
+    # of more than 12,000 visible landmarks of all views, an even share represents all
+    stride = max(1, -(-len(rows) // 12_000))
     kept = rows % stride == 0  # the same landmarks for every view, so that views still share them
     rows = rows[kept]
     view = view[kept]
@@ -103,17 +105,14 @@ def candidate_views(
             raise ConfigError("joint scores have the accuracy of the weights", value=scorer.name, fix=fix)
         if scores is not None and method is not None and method.probability:
             p_single = np.clip(np.asarray(scores, dtype=np.float64), 0, 1)
-    return CandidateViews(p_detect, terms * stride, n_visible, p_single)
+    return Detections(p_detect, terms * stride, n_visible, p_single)
 
 
 def log_position_variance(sums: Float) -> Float:
-    """Return the log (...,) of the trace of the position's covariance from sums (..., N_SUMS)."""
+    """Return the log (...,) of the trace of the position's covariance from sums (..., 16)."""
     information = information_matrices(sums[..., 1:]) + PRIOR * np.eye(6)
     covariance = np.linalg.inv(information)
     return np.log(np.trace(covariance[..., :3, :3], axis1=-2, axis2=-1))
-
-
-MIN_PROBABILITY = 1e-3  # that some view localizes on its own, or that none does
 
 
 class SetScoreModel(LogisticRegression):
@@ -129,19 +128,18 @@ class SetScoreModel(LogisticRegression):
     file = Path(__file__).with_name("set_score.json")
 
     def __call__(self, sums: Float, p_none: Float) -> Float:
-        """Return the probability (B,) of sets from their sums (B, N_SUMS) and p_none (B,), that no view localizes."""
-        p_some = np.clip(1 - np.asarray(p_none, dtype=np.float64), MIN_PROBABILITY, 1 - MIN_PROBABILITY)
+        """Return the probability (B,) of sets from their sums (B, 16) and p_none (B,), that no view localizes."""
+        p_some = np.clip(1 - np.asarray(p_none, dtype=np.float64), 1e-3, 1 - 1e-3)
         log_odds = np.log(p_some / (1 - p_some))
         return self.predict_proba(np.stack([log_odds, log_position_variance(np.asarray(sums))], axis=-1))
 
 
 MAX_VIEWS = 6  # of a set: all orders are tried
-EXCHANGES = 3  # rounds in which each view may be exchanged for a better one
 CANDIDATES = 24  # directions with the best single-view scores that a set is selected from
 SEPARATION_DEG = 15.0  # angle between candidates; nearer ones see the same
 
 SetScore = Callable[[Float, Float], Float]
-"""Scores (B,) of sets from their sums (B, N_SUMS) and the probability (B,) that no view localizes on its own."""
+"""Scores (B,) of sets from their sums (B, 16) and the probability (B,) that no view localizes on its own."""
 
 
 @dataclass(frozen=True)
@@ -253,16 +251,16 @@ def _cosine(limit_deg: float) -> float:
 
 
 def select_views(
-    views: CandidateViews,
+    views: Detections,
     set_score: SetScore,
     n: int,
     rotations: Rotations,
     max_turn_deg: float | None = None,
     single: ArrayLike | None = None,
-    exchanges: int = EXCHANGES,
+    exchanges: int = 3,
     required: int | None = None,
 ) -> ViewSet:
-    """Select the n views with the best joint score: greedily one after the other, then by exchange of single ones.
+    """Select the n views with the best joint score: greedily one after the other, then by exchange of single ones in several rounds.
 
     `single` are single-view scores (D,) that decide the first; the score of a set of one unless given. The total
     rotation stays within `max_turn_deg`. A set never scores less than the greedy one. `required` is a row that is in
@@ -315,11 +313,11 @@ def select_views(
     return ViewSet(order, score, total)
 
 
-def score_of_set(views: CandidateViews, set_score: SetScore, rows: list[int]) -> float:
+def score_of_set(views: Detections, set_score: SetScore, rows: list[int]) -> float:
     """Return the score of a set of views."""
     return float(set_score(views.joint_sums(rows)[None], np.array([views.p_none(rows)]))[0])
 
 
-def _with_each(views: CandidateViews, set_score: SetScore, rows: list[int]) -> Float:
+def _with_each(views: Detections, set_score: SetScore, rows: list[int]) -> Float:
     """Return the score (D,) of a set with each view added."""
     return set_score(views.sums_with_each(rows), views.p_none(rows) * (1 - views.p_single))

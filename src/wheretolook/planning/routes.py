@@ -1,4 +1,4 @@
-"""Choose one direction for each waypoint of a path, under a limit on the rotations between them."""
+"""Views along a path: routes through a viewpoint map, with stops."""
 
 from __future__ import annotations
 
@@ -8,22 +8,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from wheretolook.geometry.camera_turns import pan_tilt_angles
 from wheretolook.geometry.lattices import axes_of_angles
-from wheretolook.geometry.poses import Float
+from wheretolook.geometry.poses import Float, pan_tilt_angles, poses_looking_along
+from wheretolook.geometry.views import Views
 from wheretolook.planning.config import PathConfig
 from wheretolook.planning.view_sequence import TurnLimit, best_sequence, between, lengths_along
 from wheretolook.planning.viewpoint_map import ViewpointMap
 from wheretolook.utils.errors import PlanningError
-
-LIMIT_STEP_DEG = 0.5
-"""Limits on turns are rounded down to multiples of this, so that routes of similar spacing share a `TurnLimit`."""
-
-SHORT_ROUTE = "short route"
-SEARCH = "search"
-IMPROVEMENT = "improvement"
-"""How a path was found: as a short route with views chosen along it, by the search over positions and views, or by
-improving either."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +46,8 @@ class PlannedPath:
         scores: (W,) from the viewpoint map, 0 outside its free voxels, NaN without a map; from `plan_by_methods` the
             scores of these exact poses.
         cost: see `PathConfig`, by the trapezoidal rule over the map's scores.
-        found_by: `SHORT_ROUTE`, `SEARCH` or `IMPROVEMENT`; empty if the path was not planned.
+        found_by: "short route", with views chosen along it; "search" over positions and views; or "improvement" of
+            either. Empty if the path was not planned.
         stops: in the order of the path, not part of the cost.
     """
 
@@ -77,31 +69,28 @@ class PlannedPath:
         return turning_deg(self.axes) + sum(stop.turn_deg for stop in self.stops)
 
     @property
-    def n_looks(self) -> int:
-        """Views of the path and further looks at its stops."""
-        return len(self.positions) + sum(len(stop.axes) for stop in self.stops)
+    def views(self) -> Views:
+        """All L views in their order: those of the path, each followed by the further looks of a stop.
 
-    @property
-    def looks(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Row in the path (L,) and number at that position (L,) of all looks in their order.
-
-        The path's own view is 1, further looks of a stop count from 2. `all_axes` and `all_scores` are in this order.
+        `waypoint` is the row in the path, `rank` the number at that position, 1 for the path's own view; `score` is that
+        of a view on its own, `set_score` the joint one of all views there. `all_axes` is in this order.
         """
         counts = np.ones(len(self.positions), dtype=np.int64)
         for stop in self.stops:
             counts[stop.place] += len(stop.axes)
-        places = np.repeat(np.arange(len(counts)), counts)
-        return places, np.arange(len(places)) - np.repeat(np.cumsum(counts) - counts, counts) + 1
+        waypoint = np.repeat(np.arange(len(counts)), counts)
+        return Views(
+            poses_looking_along(self.positions[waypoint], self.all_axes),
+            waypoint=waypoint,
+            rank=np.arange(len(waypoint)) - np.repeat(np.cumsum(counts) - counts, counts) + 1,
+            score=self._with_further(self.scores, [stop.scores for stop in self.stops]),
+            set_score=self.scores_with_stops[waypoint],
+        )
 
     @property
     def all_axes(self) -> Float:
-        """Unit axes (L, 3) of all looks."""
+        """Unit axes (L, 3) of all views."""
         return self._with_further(self.axes, [stop.axes for stop in self.stops])
-
-    @property
-    def all_scores(self) -> Float:
-        """Single-view scores (L,) of all looks."""
-        return self._with_further(self.scores, [stop.scores for stop in self.stops])
 
     def _with_further(self, values: Float, further: list[Float]) -> Float:
         """Merge values (W, ...) of the path's views and of each stop's further looks; (L, ...)."""
@@ -116,33 +105,6 @@ class PlannedPath:
         scores = self.scores.copy()
         scores[[stop.place for stop in self.stops]] = [stop.together for stop in self.stops]
         return scores
-
-
-@dataclass(frozen=True, eq=False)
-class PathView:
-    """One view along a path.
-
-    Attributes:
-        position: (3,) m, world.
-        axis: (3,) unit optical axis.
-        score: one of `PlannedPath.scores`, NaN if unknown.
-        pixels: (K, 2) of the landmarks in view.
-        size_px: width and height of the image.
-        rgb: (H, W, 3); None if the scene cannot be rendered.
-        look: number at its position: 1 for the path's own view, more for further looks at a stop.
-        n_looks: number of looks at its position.
-        together: joint score of all looks at a stop; NaN elsewhere.
-    """
-
-    position: Float
-    axis: Float
-    score: float
-    pixels: Float
-    size_px: tuple[int, int]
-    rgb: NDArray[np.uint8] | None
-    look: int = 1
-    n_looks: int = 1
-    together: float = math.nan
 
 
 @dataclass(frozen=True, eq=False)
@@ -226,9 +188,10 @@ class RouteViews:
         return float((steps * (1 + self.config.score_weight * (1 - (scores[1:] + scores[:-1]) / 2))).sum())
 
     def _limit(self, step_m: float) -> TurnLimit:
-        number = int(self.config.max_turn_deg_per_m * step_m / LIMIT_STEP_DEG)
+        # rounded down to half degrees, so that routes of similar spacing share a limit
+        number = int(self.config.max_turn_deg_per_m * step_m / 0.5)
         if number not in self._limits:
-            self._limits[number] = TurnLimit.of(self.map.directions, number * LIMIT_STEP_DEG, pan_tilt=True)
+            self._limits[number] = TurnLimit.of(self.map.directions, number * 0.5, pan_tilt=True)
         return self._limits[number]
 
 

@@ -13,35 +13,15 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import label
 from tqdm.auto import tqdm
 
-from wheretolook.geometry.camera_turns import check_axis
 from wheretolook.geometry.lattices import VoxelGrid, axes_of_angles
-from wheretolook.geometry.poses import Float
+from wheretolook.geometry.poses import Float, check_axis
 from wheretolook.geometry.similarity import Similarity
 from wheretolook.mapping.map_frame import IDENTITY
 from wheretolook.planning.config import PathConfig
-from wheretolook.planning.routes import IMPROVEMENT, SEARCH, SHORT_ROUTE, PlannedPath, RouteSamples, RouteViews
+from wheretolook.planning.routes import PlannedPath, RouteSamples, RouteViews
 from wheretolook.planning.view_sequence import between, lengths_along
 from wheretolook.planning.viewpoint_map import ViewpointMap
 from wheretolook.utils.errors import PlanningError
-
-TABLE_STEP_DEG = 2.0  # step of yaw and pitch of the table of the map's direction nearest to an axis
-
-SHORT_SHARE = 0.25
-SEARCH_SHARE = 0.3
-SHORTEN_SHARE = 0.05
-"""Shares of the time for finding a short path, for searching positions and views jointly, and for shortening the short
-path. The rest is for improving the cheapest path."""
-
-AHEAD_SHARE = 0.5  # share of the time for finding a short path without a viewpoint map; the rest is for shortening it
-SAME_M = 1e-6  # points closer than this count as equal
-STEP_M = 1.0  # longest straight piece that the search adds at once; longer ones seldom stay free indoors
-STARTS = 12  # number of start orientations to choose from if none is given
-STEPS_M = (0.05, 1.0)  # range of the standard deviation by which a corner of a route is moved
-CELL_M = 0.1  # of the grid on which parts of the free space are found
-MAX_CELLS = 100_000  # of that grid, whose cells grow in large scenes
-_SEPARATE = """\
-Give two positions of one part, or allow narrower passages: --scenes.free_space.clearance_m 0.15, without a mesh \
---scenes.mapped_space.max_camera_distance_m 1.5."""
 
 
 class Space(Protocol):
@@ -130,12 +110,12 @@ def plan_path(
 
 def plan_shortest(request: PathRequest, budget: _TimeBudget) -> PlannedPath:
     """Plan the shortest path, with the camera looking ahead; PlanningError if none was found."""
-    route = _short_route(request, budget, AHEAD_SHARE, 1.0)
+    route = _short_route(request, budget, 0.5, 1.0)  # the rest of the time is for shortening it
     route = _shorten(route, request, budget.share(), np.random.default_rng(0))
     samples = RouteSamples.of(route, request.config.spacing_m)
     axes = _forward(samples.positions, np.radians(request.config.pitch_deg))
     unknown = np.full(len(samples.positions), np.nan)
-    return PlannedPath(samples.positions, axes, unknown, float(samples.corners[-1]), SHORT_ROUTE)
+    return PlannedPath(samples.positions, axes, unknown, float(samples.corners[-1]), "short route")
 
 
 def plan_informed(
@@ -153,19 +133,20 @@ def plan_informed(
     def cheapest() -> tuple[PlannedPath, Float]:
         return min(candidates, key=lambda candidate: candidate[0].cost)
 
+    search_share = 0.3  # of the time; what the short route and the search leave is for improving the cheapest path
     try:
-        route = _short_route(request, budget, SHORT_SHARE, 1 - SEARCH_SHARE)
-        route = _shorten(route, request, budget.share(SHORTEN_SHARE), rng)
-        add(views.best(route), route, SHORT_ROUTE)
+        route = _short_route(request, budget, 0.25, 1 - search_share)
+        route = _shorten(route, request, budget.share(0.05), rng)
+        add(views.best(route), route, "short route")
     except PlanningError:
         pass  # the search below may find one
     try:
-        search_s = max(1e-3, budget.share(SEARCH_SHARE))
+        search_s = max(1e-3, budget.share(search_share))
         states = problem.solve(
             orientations, search_s, search_s if candidates else max(1e-3, budget.share()), budget.bar
         )
-        add(problem.path(states, views), states[:, :3], SEARCH)
-        add(views.best(states[:, :3]), states[:, :3], SEARCH)
+        add(problem.path(states, views), states[:, :3], "search")
+        add(views.best(states[:, :3]), states[:, :3], "search")
     except PlanningError:
         if not candidates:
             raise
@@ -179,14 +160,15 @@ def plan_informed(
 
     better = improve(route, cost_below, best.cost, request, budget.share(), rng)
     if better is not route:
-        add(views.best(better), better, IMPROVEMENT)
+        add(views.best(better), better, "improvement")
     return cheapest()[0]
 
 
 def _short_route(request: PathRequest, budget: _TimeBudget, share: float, max_share: float) -> Float:
     """Find a short route (S, 3) m in a share of the time, or up to `max_share` until there is one."""
-    seconds = share * budget.total_s, max_share * budget.total_s
-    return _Problem(request, None).solve([(0.0, 0.0)], *seconds, budget.bar)[:, :3]
+    time_s = share * budget.total_s
+    max_s = max_share * budget.total_s
+    return _Problem(request, None).solve([(0.0, 0.0)], time_s, max_s, budget.bar)[:, :3]
 
 
 def check_ends(ends: Float, space: Space, bounds: Float, map_from_world: Similarity = IDENTITY.world_from_map) -> None:
@@ -206,14 +188,15 @@ def check_ends(ends: Float, space: Space, bounds: Float, map_from_world: Similar
             fix = f"Give a point where the camera can be{', such as ' * bool(shown)}{shown}."
             value = tuple(map_from_world.apply(point).round(6).tolist())
             raise PlanningError(f"the {name} is not in free space", value=value, fix=fix)
-    if np.linalg.norm(ends[1] - ends[0]) < SAME_M:
+    if np.linalg.norm(ends[1] - ends[0]) < 1e-6:
         raise PlanningError("the start is the goal", value=tuple(map_from_world.apply(ends[0]).tolist()))
 
 
 def are_separate(request: PathRequest) -> bool:
     """Whether start and goal are in different parts of the free space, as far as a grid shows."""
     size = np.diff(request.bounds, axis=0)[0]
-    nx, ny, nz = (size / max(CELL_M, np.cbrt(size.prod() / MAX_CELLS))).astype(int) + 1
+    # cells of 10 cm, larger if there would be more than 100,000
+    nx, ny, nz = (size / max(0.1, np.cbrt(size.prod() / 100_000))).astype(int) + 1
     grid = VoxelGrid.over(request.bounds, (nx, ny, nz))
     free = request.space.is_free(grid.centers()).reshape(grid.shape)
     parts, _ = label(free, np.ones((3, 3, 3)))
@@ -267,7 +250,7 @@ def improve(
 def propose_route_change(route: Float, bounds: Float, rng: np.random.Generator) -> tuple[Float, int, int]:
     """Draw a variation of a route (S, 3) m; returns it, and the first and last corner between which it differs."""
     n = len(route)
-    step = np.exp(rng.uniform(*np.log(STEPS_M)))
+    step = np.exp(rng.uniform(*np.log((0.05, 1.0))))  # standard deviation, metres
     kind = rng.integers(4) if n > 2 else rng.integers(2)
     if kind == 0:  # a new corner near a random point of the route
         after = int(rng.integers(1, n))
@@ -307,7 +290,7 @@ class _Problem:
             return [(0.0, 0.0)]
         if axis is None:
             middle = (self.pitch[0] + self.pitch[1]) / 2
-            return [(2 * math.pi * k / STARTS - math.pi, middle) for k in range(STARTS)]
+            return [(2 * math.pi * k / 12 - math.pi, middle) for k in range(12)]
         x, y, z = check_axis(axis)
         yaw = math.atan2(y, x)
         pitch = math.asin(z)
@@ -395,7 +378,7 @@ class _Problem:
         definition.setOptimizationObjective(objective)
         planner = geometric.RRTstar(information)
         planner.setProblemDefinition(definition)
-        planner.setRange(STEP_M)
+        planner.setRange(1.0)  # longer straight pieces seldom stay free indoors
         planner.setup()
         step = max(1e-3, min(0.25, time_s))
         spent = 0.0
@@ -406,7 +389,11 @@ class _Problem:
         if not definition.hasExactSolution():
             if are_separate(self.request):
                 problem = "start and goal seem to be in separate parts of the free space"
-                raise PlanningError(problem, value=self.request.ends.tolist(), fix=_SEPARATE)
+                fix = (
+                    "Give two positions of one part, or allow narrower passages: --scenes.free_space.clearance_m 0.15, "
+                )
+                fix += "without a mesh --scenes.mapped_space.max_camera_distance_m 1.5."
+                raise PlanningError(problem, value=self.request.ends.tolist(), fix=fix)
             fix = "Give it more time, such as --plan.planner.time_s 30, or loosen the camera's limits."
             raise PlanningError("no path was found in time", value=f"{spent:.2g} s", fix=fix)
         solution = definition.getSolutionPath()
@@ -471,7 +458,7 @@ def _angle(a: tuple[float, ...], b: tuple[float, ...]) -> float:
 
 def _nearest_directions(directions: Float) -> NDArray[np.int64]:
     """Table of the direction nearest to the centre of each cell of pitch (rows) and yaw (columns)."""
-    pitch = np.arange(-90 + TABLE_STEP_DEG / 2, 90, TABLE_STEP_DEG)
-    yaw = np.arange(-180 + TABLE_STEP_DEG / 2, 180, TABLE_STEP_DEG)
+    pitch = np.arange(-89, 90, 2)  # every two degrees
+    yaw = np.arange(-179, 180, 2)
     axes = axes_of_angles(np.stack(np.meshgrid(yaw, pitch), axis=-1))
     return np.asarray((axes @ directions.T).argmax(-1))

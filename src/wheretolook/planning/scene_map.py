@@ -1,4 +1,4 @@
-"""Build a viewpoint map: of a scene, or of any occlusion model and scorer."""
+"""Viewpoint maps of a scene, or of any occlusion model and scorer, and paths planned by several methods."""
 
 from __future__ import annotations
 
@@ -13,24 +13,27 @@ from numpy.typing import ArrayLike, NDArray
 from tqdm.auto import tqdm
 
 from wheretolook.dataset.config import Accuracy
+from wheretolook.dataset.layout import Dataset
 from wheretolook.dataset.scene import Scene
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.lattices import ViewLattice, VoxelGrid
-from wheretolook.geometry.poses import Float, poses_looking_along, rotation_looking_along
+from wheretolook.geometry.poses import Float, poses_looking_along, rotation_looking_along, transform
+from wheretolook.geometry.views import Views
+from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.landmarks import Landmarks
-from wheretolook.planning.config import MAX_DIRECTIONS
-from wheretolook.planning.rrt import Space
+from wheretolook.planning.config import FORWARD, MAX_DIRECTIONS, PlanConfig
+from wheretolook.planning.routes import PlannedPath
+from wheretolook.planning.rrt import Space, check_ends, plan_path
+from wheretolook.planning.stops import check_stopping, stops_along, within_pitch
 from wheretolook.planning.viewpoint_map import MapOrigin, ViewpointMap
+from wheretolook.rendering.warp_renderer import Renderer
 from wheretolook.scorers.base import Scorer
 from wheretolook.scorers.registry import FALLBACK, is_probability, make_scorer, methods_named, scorers
-from wheretolook.scorers.weights import load_scorer
+from wheretolook.scorers.weights import load_scorer, resolve_weights
 from wheretolook.utils.errors import ConfigError, SceneError, check_range
 from wheretolook.visibility.counting import SurveyOptions, survey
 
 Text = str | None  # text of progress bars; None shows none
-
-VIEWS_AT_ONCE = 16_384
-"""Views scored at a time, in whole locations: enough to fill a GPU, few enough for the progress bar to move."""
 
 
 def build_viewpoint_map(
@@ -62,9 +65,19 @@ def build_viewpoint_map(
     landmarks = scorer.localization_map.landmarks
     row_of_voxel = np.full(len(grid), -1, dtype=np.int32)
     row_of_voxel[rows] = np.arange(len(rows))
-    by_row = _score_and_count(scorer, grid.centers()[rows], axes, progress)
+    ranked, scores, n_visible = _score_and_count(scorer, grid.centers()[rows], axes, progress)
     digests = landmark_digests(landmarks)
-    return ViewpointMap(grid, row_of_voxel, axes, *by_row, landmarks.ids, digests, _origin(scorer, lattice, digests))
+    return ViewpointMap(
+        grid=grid,
+        row_of_voxel=row_of_voxel,
+        directions=axes,
+        ranked=ranked,
+        scores=scores,
+        n_visible=n_visible,
+        landmark_ids=landmarks.ids,
+        landmark_digests=digests,
+        origin=_origin(scorer, lattice, digests),
+    )
 
 
 def landmark_digests(landmarks: Landmarks) -> NDArray[np.uint64]:
@@ -90,7 +103,8 @@ def _score_and_count(
     counted = survey(localization_map.camera, rotations, locations, points, localization_map.occlusion, options)
     ranked = np.empty((len(locations), len(directions)), dtype=np.uint16)
     scores = np.empty(ranked.shape, dtype=np.float32)
-    block = max(1, VIEWS_AT_ONCE // len(directions))
+    # enough views at once to fill a GPU, few enough for the progress bar to move
+    block = max(1, 16_384 // len(directions))
     text = progress and f"{progress}: score"
     with tqdm(total=len(locations), desc=text, unit="voxel", disable=progress is None) as bar:
         for begin in range(0, len(locations), block):
@@ -124,12 +138,6 @@ def _origin(scorer: Scorer, lattice: str, digests: NDArray[np.uint64]) -> MapOri
     if isinstance(camera, PinholeCamera):  # stored in one form, whatever the model
         intrinsics |= {"model": "PINHOLE", "params": [float(v) for v in (camera.fx, camera.fy, camera.cx, camera.cy)]}
     return MapOrigin(scorer.name, lattice, intrinsics, localization_map.occlusion.name, digest)
-
-
-REACH = 2  # voxels along each axis from which views may be taken
-
-INSIDE = np.stack(np.meshgrid(*[(-1 / 3, 0.0, 1 / 3)] * 3, indexing="ij"), -1).reshape(-1, 3)
-"""Points (27, 3) of a voxel that are tested for free space, relative to its centre in units of its size."""
 
 
 def scene_scorer(
@@ -203,17 +211,86 @@ def fill_partially_free_voxels(viewpoint_map: ViewpointMap, space: Space) -> Vie
     size = viewpoint_map.grid.voxel_m
     known = np.flatnonzero(rows >= 0)
     unknown = np.flatnonzero(rows < 0)
-    points = centers[unknown][:, None] + INSIDE * size
-    free = space.is_free(points.reshape(-1, 3)).reshape(len(unknown), len(INSIDE))
-    order = np.argsort((INSIDE**2).sum(1), kind="stable")
+    # points (27, 3) of a voxel that are tested, relative to its centre in units of its size
+    offsets = np.stack(np.meshgrid(*[(-1 / 3, 0.0, 1 / 3)] * 3, indexing="ij"), -1).reshape(-1, 3)
+    points = centers[unknown][:, None] + offsets * size
+    free = space.is_free(points.reshape(-1, 3)).reshape(len(unknown), len(offsets))
+    order = np.argsort((offsets**2).sum(1), kind="stable")
     for voxel, inside, is_free in zip(unknown, points, free, strict=True):
         if not is_free.any():
             continue
         start = inside[order[is_free[order]][0]]  # the free point nearest to the centre
-        near = known[(np.abs(centers[known] - centers[voxel]) <= (REACH + 1e-6) * size).all(1)]
+        # at most two voxels away along each axis
+        near = known[(np.abs(centers[known] - centers[voxel]) <= (2 + 1e-6) * size).all(1)]
         near = near[np.argsort(np.linalg.norm(centers[near] - start, axis=1), kind="stable")]
         if len(near):
             clear = space.segments_are_free(np.tile(start, (len(near), 1)), centers[near])
             if clear.any():
                 rows[voxel] = viewpoint_map.row_of_voxel[near[int(np.argmax(clear))]]
     return replace(viewpoint_map, row_of_voxel=rows, origin=viewpoint_map.origin.derive("views borrowed by neighbours"))
+
+
+def plan_by_methods(
+    scene: Scene,
+    dataset: Dataset | None,
+    methods: Iterable[str],
+    start: ArrayLike,
+    goal: ArrayLike,
+    config: PlanConfig = PlanConfig(),
+) -> dict[str, PlannedPath]:
+    """Plan a path from start to goal, (3,) in the map's own frame, by each method, with progress bars.
+
+    Returned paths are in the world: metres, z up. A method plans by its own viewpoint map, whose scores are of views from the centres of voxels. The scores of the
+    returned path are of its exact poses, in the scorer's units; NaN for "forward". Its cost is still the planner's. If
+    `config.stops` asks for them, paths get stops (`stops_along`) where the method's scores are probabilities; the last
+    method's must be.
+
+    Methods are "forward", or names of scorers; empty for that of the weights, or bins without. `config` has weights for
+    learned methods, if they are of their kind (`resolve_weights`); without them they are the dataset's or the bundled
+    ones. Returns paths by the names of their methods, in
+    the order given. Raises ConfigError if a method needs weights or there is none of that name, or the last cannot
+    stop; PlanningError if no path can be found.
+    """
+    methods = tuple(methods)
+    space = scene.space
+    check_methods(methods)
+    stopping = config.stops.looks > 1
+    if stopping and methods and methods[-1]:
+        check_stopping(methods[-1])
+    world_from_map = scene.frame.world_from_map
+    start, goal = ends = world_from_map.apply(np.array([start, goal], dtype=np.float64))
+    check_ends(ends, space, space.bounds, world_from_map.inverse)  # before maps are built
+    paths: dict[str, PlannedPath] = {}
+    for number, method in enumerate(methods, 1):
+        if method == FORWARD:
+            name = method
+            path = plan_path(start, goal, space, space.bounds, None, config.planner)
+        else:
+            weights = resolve_weights(method, config.weights, dataset=dataset)
+            accuracy = config.accuracy if number == len(methods) else None
+            scorer = scene_scorer(scene, method, weights, config.anywhere, accuracy)
+            views = planner_map(scene, config, scorer)
+            name = method or scorer.name
+            path = plan_path(start, goal, space, space.bounds, views, config.planner)
+            path = replace(path, scores=scorer.score(poses_looking_along(path.positions, path.axes)))
+            if stopping and (is_probability(scorer.name) or number == len(methods)):
+                axes = within_pitch(views.directions, config.planner)
+                stops = stops_along(
+                    scorer, path.positions, path.axes, axes, config.stops, config.planner, progress="stops"
+                )
+                path = replace(path, stops=stops)
+        paths.pop(name, None)  # a method named twice comes where it was named last
+        paths[name] = path
+    return paths
+
+
+def path_views(path: PlannedPath, localization_map: LocalizationMap, renderer: Renderer | None = None) -> Views:
+    """Return `PlannedPath.views` with the camera, the pixels of the landmarks in view, and images if there is a renderer."""
+    views = path.views
+    camera = localization_map.camera
+    points = localization_map.landmarks.points
+    pixels = []
+    for pose, rows in zip(views.cam_from_world, localization_map.landmarks_in_view(views.cam_from_world), strict=True):
+        pixels.append(camera.project(transform(pose, points[rows])))
+    images = None if renderer is None else renderer.render(camera, views.cam_from_world).rgb
+    return replace(views, camera=camera, pixels=tuple(pixels), images=images)

@@ -10,8 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.special import expit
 from tqdm.auto import tqdm
 
-from wheretolook.geometry.camera_turns import angles_to_axis_deg
-from wheretolook.geometry.poses import Float, poses_looking_along
+from wheretolook.geometry.poses import Float, angles_to_axis_deg, poses_looking_along
+from wheretolook.geometry.views import Views
 from wheretolook.looks.selection import (
     CANDIDATES,
     SEPARATION_DEG,
@@ -29,20 +29,6 @@ from wheretolook.scorers.base import Scorer
 from wheretolook.scorers.registry import is_probability
 from wheretolook.utils.errors import ConfigError, PlanningError
 
-COMPASS = np.stack([np.cos(np.arange(8) * np.pi / 4), np.sin(np.arange(8) * np.pi / 4)], axis=1)
-"""Steps (8, 2) in the plane that touches the sphere at the current axis."""
-
-
-@dataclass(frozen=True, eq=False)
-class RefinedViews:
-    """Result of a local search: unit axes (B, 3) in the world, their scores (B,), which are at least the scores (B,) at the
-    start, and the number of scored views."""
-
-    axes: Float
-    scores: Float
-    start_scores: Float
-    n_scored: int
-
 
 def refine_directions(
     scorer: Scorer,
@@ -51,7 +37,7 @@ def refine_directions(
     max_angle_deg: float = 10.0,
     first_step_deg: float = 4.0,
     last_step_deg: float = 0.25,
-) -> RefinedViews:
+) -> Views:
     """Improve axes by a pattern search on the sphere (Hooke and Jeeves 1961; compass search, Kolda et al. 2003).
 
     Eight axes one step away from the current one are scored; the best of them replaces it if it scores higher,
@@ -60,23 +46,20 @@ def refine_directions(
 
     The search begins at locations (B, 3) m with axes (B, 3) of any length, such as the best of a lattice. The default
     `max_angle_deg` from there exceeds the distance of neighbours on a lattice of 500 directions; about half that
-    distance works well as the first step. Raises ValueError if locations or axes are not finite, have no length or
+    distance works well as the first step. Returns views with their scores, none below that of its start. Raises ValueError if locations or axes are not finite, have no length or
     differ in number, or an angle is not positive.
     """
     if not (max_angle_deg > 0 and first_step_deg > 0 and last_step_deg > 0):
         raise ValueError("angles must be positive")
     at, start = (np.asarray(values, dtype=np.float64).reshape(-1, 3) for values in (locations, axes))
-    start_scores = scorer.score(poses_looking_along(at, start))  # raises on what is not finite
+    scores = scorer.score(poses_looking_along(at, start))  # raises on what is not finite
     start = start / np.linalg.norm(start, axis=1, keepdims=True)
     current = start.copy()
     step_deg = np.full(len(start), float(min(first_step_deg, max_angle_deg)))
-    scores = start_scores.copy()
-    n_scored = len(start)
     while len(active := np.flatnonzero(step_deg >= last_step_deg)):
         candidates = _neighbour_directions(current[active], step_deg[active])
         candidates = _within(candidates, start[active, None], max_angle_deg)
         values = scorer.score(poses_looking_along(np.repeat(at[active], 8, axis=0), candidates.reshape(-1, 3)))
-        n_scored += len(values)
         values = values.reshape(-1, 8)
         best = values.argmax(axis=1)
         value = values[np.arange(len(active)), best]
@@ -85,7 +68,7 @@ def refine_directions(
         current[moved] = candidates[better, best[better]]
         scores[moved] = value[better]
         step_deg[active[~better]] /= 2
-    return RefinedViews(current, scores, start_scores, n_scored)
+    return Views(poses_looking_along(at, current), method=scorer.name, score=scores)
 
 
 def _neighbour_directions(axes: Float, step_deg: Float) -> Float:
@@ -93,7 +76,8 @@ def _neighbour_directions(axes: Float, step_deg: Float) -> Float:
     u = np.cross(axes, np.eye(3)[np.abs(axes).argmin(axis=1)])  # with a coordinate axis that is not parallel
     u /= np.linalg.norm(u, axis=1, keepdims=True)
     angle = np.radians(step_deg)[:, None, None]
-    across = COMPASS[:, :1] * u[:, None] + COMPASS[:, 1:] * np.cross(axes, u)[:, None]
+    at = np.arange(8)[:, None] * np.pi / 4  # in the plane that touches the sphere at the axis
+    across = np.cos(at) * u[:, None] + np.sin(at) * np.cross(axes, u)[:, None]
     return np.asarray(np.cos(angle) * axes[:, None] + np.sin(angle) * across)
 
 
@@ -104,16 +88,6 @@ def _within(candidates: Float, start: Float, max_angle_deg: float) -> Float:
     across = candidates - (candidates * start).sum(-1, keepdims=True) * start
     across /= np.maximum(np.linalg.norm(across, axis=-1, keepdims=True), 1e-12)
     return np.where(outside, np.cos(limit) * start + np.sin(limit) * across, candidates)
-
-
-TURNS_DEG = (45.0, 90.0, 180.0, None)
-"""Limits on the rotation from the path's view to the last look, in the order they are tried; None for no limit."""
-
-NEAR_DEG = 60.0
-N_NEAR = 8
-"""Number of candidates within this angle of the path's view, so that small rotations are possible."""
-
-MIN_PROBABILITY = 1e-3  # probabilities are clipped to this distance from 0 and 1 before odds are taken
 
 
 def stops_along(
@@ -183,8 +157,9 @@ def _best_stop(scorer: Scorer, view: _View, directions: Float, config: StopConfi
     if len(apart) == 0:
         return None
     scores = scorer.score_directions(view.position[None], apart)[0]
-    near = np.flatnonzero(apart @ view.axis > math.cos(math.radians(NEAR_DEG)))
-    rows = np.union1d(candidates(apart, scores, CANDIDATES), near[candidates(apart[near], scores[near], N_NEAR)])
+    near = np.flatnonzero(apart @ view.axis > math.cos(math.radians(60.0)))
+    # further ones near the path's view, so that small rotations are possible
+    rows = np.union1d(candidates(apart, scores, CANDIDATES), near[candidates(apart[near], scores[near], 8)])
     axes = np.concatenate([view.axis[None], apart[rows]])
     single = np.append(view.score, scores[rows])
     visible = candidate_views(scorer, view.position, axes, single)
@@ -194,7 +169,7 @@ def _best_stop(scorer: Scorer, view: _View, directions: Float, config: StopConfi
     best = None
     best_gain = 0.0
     for n in range(2, min(config.looks, len(axes)) + 1):
-        for limit in TURNS_DEG:
+        for limit in (45.0, 90.0, 180.0, None):  # degrees from the path's view to the last look
             try:
                 chosen = select_views(visible, set_score, n, rotations, limit, required=0)
             except PlanningError:  # no directions within the limit
@@ -215,5 +190,5 @@ def _best_stop(scorer: Scorer, view: _View, directions: Float, config: StopConfi
 
 def _raised(probability: float, before: float, after: float) -> float:
     """Raise the odds of a probability by the ratio of the odds of `after` and `before`."""
-    a, b, c = finite_log_odds([probability, before, after], MIN_PROBABILITY)
+    a, b, c = finite_log_odds([probability, before, after], 1e-3)
     return float(expit(a + c - b))

@@ -7,11 +7,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from wheretolook.geometry import camera_turns as turns
-from wheretolook.geometry.poses import Float, rotation_looking_along
+from wheretolook.geometry.poses import (
+    Float,
+    check_axis,
+    pan_tilt_turns_deg,
+    rotation_looking_along,
+    turns_deg,
+    turns_from_deg,
+    within,
+)
 from wheretolook.utils.errors import PlanningError
-
-MAX_TURN_DEG = 30.0  # limit of the Active Localization Benchmark between waypoints
 
 
 @dataclass(frozen=True, eq=False)
@@ -19,7 +24,7 @@ class TurnLimit:
     """Directions that can follow each other: those that a camera without roll reaches by one rotation within a limit.
 
     `directions` (D, 3) are unit optical axes in the world; `max_turn_deg` is the largest angle of the rotation between
-    two waypoints, included, that of a pan-tilt head if `pan_tilt` (`turns.pan_tilt_turns_deg`); `neighbours` (D, K) are
+    two waypoints, included, that of a pan-tilt head if `pan_tilt` (`pan_tilt_turns_deg`); `neighbours` (D, K) are
     the ids reachable from each direction, including itself, ascending, padded with D.
     """
 
@@ -29,14 +34,14 @@ class TurnLimit:
     pan_tilt: bool = False
 
     @classmethod
-    def of(cls, directions: ArrayLike, max_turn_deg: float = MAX_TURN_DEG, pan_tilt: bool = False) -> TurnLimit:
-        """Make the limit for a lattice of unit vectors (D, 3), such as `direction_lattice` gives.
+    def of(cls, directions: ArrayLike, max_turn_deg: float = 30.0, pan_tilt: bool = False) -> TurnLimit:
+        """Make the limit for a lattice of unit vectors (D, 3), by default that of the Active Localization Benchmark.
 
         Raises ValueError for a limit that is negative or NaN.
         """
         axes = np.asarray(directions, dtype=np.float64)
-        angles = turns.pan_tilt_turns_deg(axes, axes) if pan_tilt else turns.turns_deg(axes)
-        reachable = turns.within(angles, max_turn_deg)
+        angles = pan_tilt_turns_deg(axes, axes) if pan_tilt else turns_deg(axes)
+        reachable = within(angles, max_turn_deg)
         ids = np.sort(np.where(reachable, np.arange(len(axes)), len(axes)), axis=1)
         return cls(axes, float(max_turn_deg), ids[:, : int(reachable.sum(axis=1).max(initial=0))], pan_tilt)
 
@@ -48,9 +53,9 @@ class TurnLimit:
         if start is None:
             return np.ones(len(self.directions), dtype=bool)
         if self.pan_tilt:
-            angles = turns.pan_tilt_turns_deg(turns.check_axis(start)[None], self.directions)[0]
-            return turns.within(angles, self.max_turn_deg)
-        return turns.within(turns.turns_from_deg(start, rotation_looking_along(self.directions)), self.max_turn_deg)
+            angles = pan_tilt_turns_deg(check_axis(start)[None], self.directions)[0]
+            return within(angles, self.max_turn_deg)
+        return within(turns_from_deg(start, rotation_looking_along(self.directions)), self.max_turn_deg)
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,9 +12,16 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from wheretolook.geometry.camera_turns import angles_to_axis_deg, check_axis, turns_from_deg, within
 from wheretolook.geometry.lattices import VoxelGrid
-from wheretolook.geometry.poses import Float, rotation_looking_along
+from wheretolook.geometry.poses import (
+    Float,
+    angles_to_axis_deg,
+    check_axis,
+    rotation_looking_along,
+    turns_from_deg,
+    within,
+)
+from wheretolook.geometry.views import Views
 from wheretolook.looks.selection import best_views
 from wheretolook.utils.errors import ConfigError, MapFormatError
 from wheretolook.utils.files import atomic_folder, read_json, save_npy, sha256, write_json, write_text
@@ -41,7 +48,6 @@ ARRAYS = {
 }
 """Little-endian type, shape and meaning of each array; each is a file `<name>.npy`."""
 
-_WAIT_S = 120.0  # for another process that writes into the same folder
 
 REBUILD = "Build it again with `wheretolook viewpoint-map`, or get the folder again."
 
@@ -112,7 +118,7 @@ def write_map(
     """
     folder = Path(folder).resolve()  # so that "." has a name too
     _check_replaceable(folder)
-    with hold(folder.with_name(f".{folder.name}.lock"), "viewpoint map", wait_s=_WAIT_S), atomic_folder(folder) as new:
+    with hold(folder.with_name(f".{folder.name}.lock"), "viewpoint map", wait_s=120.0), atomic_folder(folder) as new:
         _write(new, grid, origin, arrays)
 
 
@@ -218,16 +224,6 @@ class ViewChoice(NamedTuple):
     n_visible: int
 
 
-@dataclass(frozen=True, eq=False)
-class ViewChoices:
-    """Best orientations at N points; `found` is False outside the grid or in a voxel that is not free."""
-
-    found: NDArray[np.bool_]
-    direction_id: NDArray[np.int64]  # -1 where not found
-    score: NDArray[np.float32]  # NaN where not found
-    n_visible: NDArray[np.int64]  # 0 where not found
-
-
 @dataclass(frozen=True)
 class MapOrigin:
     """Origin of a viewpoint map.
@@ -260,7 +256,7 @@ class ViewpointMap:
 
     A point gets the scores of its voxel, which were computed at the centre; `interpolated` is smooth between centres.
     For points outside the grid or in voxels that are not free, queries of one point return None, and batches
-    `found = False`. Points that are not finite raise a ValueError. See `map_building.build_viewpoint_map`.
+    the direction -1. Points that are not finite raise a ValueError. See `map_building.build_viewpoint_map`.
 
     Attributes:
         grid: V voxels of the world, metres, z up.
@@ -408,11 +404,22 @@ class ViewpointMap:
         chosen = best_views(scorer, at, self.directions, self.scores[row], n, max_turn_deg, start)
         return [self._choice(row, look) for look in chosen.rows]
 
-    def best_many(self, points: ArrayLike) -> ViewChoices:
-        """Return the best orientation at each of world points (N, 3) m; raises as `rows`."""
+    def best_many(self, points: ArrayLike) -> Views:
+        """Return the best view at each of world points (N, 3) m, with `direction_id`, `score` and `n_visible`.
+
+        Where no voxel is free, `direction_id` is -1, poses and scores are NaN, and `n_visible` is 0. Raises as `rows`.
+        """
         rows = self.rows(points)
-        direction, score, n_visible = self._best_of_rows
-        return ViewChoices(rows >= 0, direction[rows], score[rows], n_visible[rows])
+        ids, scores, n_visible = self._best_of_rows
+        rotations = np.concatenate([self._rotations, np.full((1, 3, 3), np.nan)])[ids[rows]]  # the last for -1
+        translations = -rotations @ np.asarray(points, dtype=np.float64)[..., None]
+        return Views(
+            np.concatenate([rotations, translations], axis=-1),
+            method=self.origin.scorer,
+            direction_id=ids[rows],
+            score=scores[rows],
+            n_visible=n_visible[rows],
+        )
 
     def rows(self, points: ArrayLike) -> NDArray[np.int64]:
         """Return the rows (N,) of the free voxels that contain world points (N, 3) m; -1 where none does.
@@ -435,8 +442,9 @@ class ViewpointMap:
             return None
         at = (np.asarray(point, dtype=np.float64) - self.grid.lower) / self.grid.voxel_m - 0.5
         low = np.floor(at).astype(np.int64)
-        corners = low + _CORNERS
-        weights = np.prod(np.where(_CORNERS == 1, at - low, 1 - (at - low)), axis=1)
+        upper = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), axis=-1).reshape(8, 3)
+        corners = low + upper
+        weights = np.prod(np.where(upper == 1, at - low, 1 - (at - low)), axis=1)
         exists = ((corners >= 0) & (corners < self.grid.shape)).all(axis=1)
         rows = self.row_of_voxel[np.ravel_multi_index(tuple(corners[exists].T), self.grid.shape)]
         weights = weights[exists][rows >= 0]
@@ -490,6 +498,3 @@ class ViewpointMap:
 def _ranks_nothing(error: IndexError) -> MapFormatError:
     """Return the error for a damaged file that was mapped into memory without comparing its checksum."""
     return MapFormatError(f"ranked.npy is damaged: {error}", fix=REBUILD)
-
-
-_CORNERS = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), axis=-1).reshape(8, 3)

@@ -33,8 +33,6 @@ from wheretolook.select.query_images import KnownCamera, QueryImage, QueryImages
 from wheretolook.utils.errors import ConfigError, MapError, PoseError, TableError, from_record
 from wheretolook.utils.files import path_ends, read_json_object, read_text
 
-MAX_BYTES = 2**28
-
 
 @dataclass(frozen=True, eq=False)
 class ImagePairs:
@@ -53,7 +51,7 @@ class ImagePairs:
         images: dict[str, list[int]] = defaultdict(list)
         row_of = {name: row for row, name in enumerate(model.image_names)}
         try:
-            lines = read_text(path, MAX_BYTES).splitlines()
+            lines = read_text(path, 2**28).splitlines()
         except (OSError, ValueError) as error:
             raise TableError(f"the pairs of images cannot be read: {error}", path=path) from error
         for number, line in enumerate(lines, 1):
@@ -82,9 +80,6 @@ class ImagePairs:
 
 
 Image = str | Path | NDArray[np.uint8]
-
-TURN_NOISE_DEG = 0.2  # of given rotations, one standard deviation about each axis
-MAX_MOVE_M = 0.1  # of a camera that turns in place
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,7 +134,8 @@ class ImageLocalizer:
 
     @cached_property
     def _rigs(self) -> JointLocalizer:
-        return JointLocalizer(self._localizer.estimator, TURN_NOISE_DEG, check_turns=True)
+        # given rotations have a standard deviation of 0.2 degrees about each axis
+        return JointLocalizer(self._localizer.estimator, 0.2, check_turns=True)
 
     def localize(
         self,
@@ -249,7 +245,7 @@ class ImageLocalizer:
         if self.frame.scale.is_metric:
             return cam_from_rig
         moved = float(np.linalg.norm(cam_from_rig[:, :, 3] - cam_from_rig[0, :, 3], axis=1).max())
-        if moved > MAX_MOVE_M:
+        if moved > 0.1:  # a camera that turns in place moves less
             problem = "the camera moved between the images, and the unit of the map is unknown"
             raise ConfigError(problem, value=f"{moved:.2g} m", fix="Give --scale.")
         return cam_from_rig * (1, 1, 1, 0)

@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pandas as pd
 
 from wheretolook.dataset.config import CONTRADICTED, LOCALIZED, NO_POSE
 from wheretolook.geometry.camera import Camera
-from wheretolook.geometry.camera_turns import pan_tilt_angles
 from wheretolook.geometry.pose_files import images_text
-from wheretolook.geometry.poses import Float, camera_centers, quaternion_from_rotation
+from wheretolook.geometry.poses import Float, camera_centers, pan_tilt_angles, quaternion_from_rotation
 from wheretolook.localization.rig_localization import JointLocalization
 from wheretolook.mapping.map_frame import IDENTITY, MapFrame
 from wheretolook.select.query_images import QueryImage
@@ -21,7 +21,6 @@ from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.files import write_json, write_text
 
 if TYPE_CHECKING:
-    import pandas as pd
     from matplotlib.figure import Figure
 
 
@@ -134,9 +133,8 @@ class Localized:
 
     def table(self) -> pd.DataFrame:
         """Return a row for each image; NaN where there is no pose."""
-        import pandas as pd
-
-        values = np.full((len(self), len(POSE_COLUMNS)), np.nan)
+        columns = (*"xyz", "yaw_deg", "pitch_deg", "qw", "qx", "qy", "qz", "deviation", "deviation_deg")
+        values = np.full((len(self), len(columns)), np.nan)
         if self.cam_from_world is not None:
             quaternions = quaternion_from_rotation(np.swapaxes(self.cam_from_world[:, :, :3], 1, 2))
             angles = np.degrees(pan_tilt_angles(self.cam_from_world[:, 2, :3] @ self.frame.world_from_map.rotation.T))
@@ -148,7 +146,7 @@ class Localized:
                 "image": self.names,
                 "status": self.status,
                 "probability": self.probability,
-                **dict(zip(POSE_COLUMNS, values.T, strict=True)),
+                **dict(zip(columns, values.T, strict=True)),
                 "n_matches": self.n_matches,
                 "n_inliers": self.n_inliers,
                 "n_rivals": len(self.rivals),
@@ -158,9 +156,6 @@ class Localized:
                 "focal_px": [camera.colmap.mean_focal_px for camera in self.cameras] or np.nan,
             }
         )
-
-
-POSE_COLUMNS = (*"xyz", "yaw_deg", "pitch_deg", "qw", "qx", "qy", "qz", "deviation", "deviation_deg")
 
 
 def check_localized_format(path: Path) -> str:
@@ -174,8 +169,6 @@ def check_localized_format(path: Path) -> str:
 
 def save_localized(results: Sequence[Localized], path: Path) -> None:
     """Write results to a file of the format of its name, atomically; images.txt has the localized ones only."""
-    import pandas as pd
-
     suffix = check_localized_format(path)
     if suffix == "csv":
         table = pd.concat([result.table() for result in results])

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from wheretolook.geometry.camera_turns import pan_tilt_angles
 from wheretolook.geometry.lattices import VoxelGrid
 from wheretolook.geometry.pose_files import (
     QUATERNION_COLUMNS,
@@ -20,7 +19,13 @@ from wheretolook.geometry.pose_files import (
     poses_of_rows,
     read_named_rows,
 )
-from wheretolook.geometry.poses import Float, camera_centers, quaternion_from_rotation, rotation_from_quaternion
+from wheretolook.geometry.poses import (
+    Float,
+    camera_centers,
+    pan_tilt_angles,
+    quaternion_from_rotation,
+    rotation_from_quaternion,
+)
 from wheretolook.looks.selection import MAX_VIEWS
 from wheretolook.utils.errors import ConfigError, SceneError, TableError, check_limits, check_pitch, check_range, reject
 
@@ -28,10 +33,6 @@ if TYPE_CHECKING:
     from wheretolook.inputs.localization_map import LocalizationMap
 
 MAX_LOCATIONS = 1_000_000  # voxels of a grid
-REACH_SHARE = 0.95  # of the landmarks' mapping distances; farther from all of them the map is unknown
-ON_LANDMARK_M = 1e-6  # a location this close to a landmark is on a surface
-BODY_UPRIGHT = 0.7  # z of a robot's own z axis, from which on it is no camera
-LISTED = 5  # waypoints that an error names
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +66,7 @@ class Waypoints:
         if self.headings is not None and self.headings.shape[1] == 4:
             is_known = np.linalg.norm(self.headings, axis=1) > 0
             axes = world_from_map @ rotation_from_quaternion(self.headings + ~is_known[:, None])
-            forward = np.where(axes[:, 2, 2:] > BODY_UPRIGHT, axes[..., 0], axes[..., 2])
+            forward = np.where(axes[:, 2, 2:] > 0.7, axes[..., 0], axes[..., 2])
             yaw = np.where(is_known, np.degrees(pan_tilt_angles(forward)[0]), np.nan)
         for row in np.flatnonzero(~np.isfinite(yaw)).tolist():
             fix = "Give a TUM trajectory or a CSV with heading_deg or qw, qx, qy, qz, in Python heading_deg; or leave pan out."
@@ -169,21 +170,21 @@ def usable_waypoints(localization_map: LocalizationMap, waypoints: Waypoints, sk
     landmarks = localization_map.landmarks
     world_from_map = localization_map.frame.world_from_map
     points = world_from_map.apply(waypoints.points)
-    reach = float(np.quantile(landmarks.mapping_distance_m, REACH_SHARE))
+    reach = float(np.quantile(landmarks.mapping_distance_m, 0.95))
     to_landmark = cKDTree(landmarks.points).query(points)[0]
     nearest: Float = to_landmark
     if localization_map.mapping_poses is not None:
         centers = camera_centers(localization_map.mapping_poses.astype(np.float64))
         nearest = np.minimum(nearest, cKDTree(centers).query(points)[0])
     outside = nearest > reach
-    inside = ~outside & (to_landmark <= ON_LANDMARK_M)
+    inside = ~outside & (to_landmark <= 1e-6)  # landmarks are on surfaces
     rest = np.flatnonzero(~outside & ~inside)
     inside[rest] = localization_map.occlusion.inside_geometry(points[rest])
     bad = outside | inside
     if not bad.any() or (skip and not bad.all()):
         return np.asarray(~bad)
     problems = []
-    for row in np.flatnonzero(bad)[:LISTED]:
+    for row in np.flatnonzero(bad)[:5]:
         why = (
             f"{nearest[row] / world_from_map.scale:.3g} from all landmarks and cameras"
             if outside[row]

@@ -1,38 +1,34 @@
-"""Which views are asked for: how many, within which pitch, and how far the camera may turn."""
+"""The entry point in Python: views of your own COLMAP model, and images localized in it."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
-from tqdm.auto import tqdm
+from numpy.typing import ArrayLike
 
 from wheretolook.dataset.config import ACCURACY, Accuracy
 from wheretolook.dataset.scene import ColmapFiles, Scene, SceneConfig
 from wheretolook.geometry.camera import Camera, PinholeCamera, parse_camera
-from wheretolook.geometry.camera_turns import pan_tilt_angles
 from wheretolook.geometry.lattices import Lattice, direction_lattice
-from wheretolook.geometry.poses import Float, camera_centers, poses_looking_along, rigid_poses
+from wheretolook.geometry.poses import Float, camera_centers, rigid_poses
 from wheretolook.geometry.views import Views
 from wheretolook.inputs.landmark_features import ReasonCounter
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.looks.next_look import NextLook, NextLookSelector, mean_scores_by_pitch
-from wheretolook.looks.selection import best_views, separated
 from wheretolook.mapping.config import FrameOptions
 from wheretolook.mapping.map_frame import MapFrame
-from wheretolook.planning.config import StopConfig
-from wheretolook.planning.routes import PlannedPath
-from wheretolook.planning.stops import stops_along
-from wheretolook.planning.view_sequence import TurnLimit, best_sequence
 from wheretolook.scorers.base import Scorer
+from wheretolook.scorers.registry import make_scorer
+from wheretolook.scorers.weights import load_scorer, resolve_weights
+from wheretolook.select.selection import explained, reported, select_views
 from wheretolook.select.waypoints import SelectionRequest, Waypoints, grid_waypoints, usable_waypoints
-from wheretolook.space.mapped_space import MappedSpace
+from wheretolook.space.free_space import MappedSpace
 from wheretolook.utils.devices import usable_device
 from wheretolook.utils.errors import ConfigError, PlanningError
 
@@ -41,78 +37,6 @@ if TYPE_CHECKING:
 
     from wheretolook.select.image_localizer import Image, ImageLocalizer
     from wheretolook.select.localized import Localized
-
-
-DRAWS = 32  # of the true pose, the same at each waypoint
-ALTERNATIVES = 60  # directions with the best scores, which are compared
-
-
-@dataclass(frozen=True)
-class PoseUncertainty:
-    """Gaussian uncertainty of a robot's pose: of x and y each in metres, and of yaw in degrees; height is known."""
-
-    sigma_m: float
-    yaw_sigma_deg: float
-
-    def draws(self) -> tuple[Float, Float]:
-        """Return errors of position (DRAWS, 3) m and rotations about the vertical (DRAWS, 3, 3), in the world."""
-        normal = np.random.default_rng(0).standard_normal((DRAWS, 3))
-        offsets = normal * (self.sigma_m, self.sigma_m, 0.0)
-        yaw = np.radians(self.yaw_sigma_deg) * normal[:, 2]
-        rotations = np.tile(np.eye(3), (DRAWS, 1, 1))
-        rotations[:, 0, 0] = rotations[:, 1, 1] = np.cos(yaw)
-        rotations[:, 1, 0] = np.sin(yaw)
-        rotations[:, 0, 1] = -rotations[:, 1, 0]
-        return offsets, rotations
-
-    def expected_scores(
-        self,
-        scorer: Scorer,
-        points: Float,
-        axes: Float,
-        allowed: NDArray[np.bool_],
-        chosen: tuple[NDArray[np.int64], Float],
-        progress: bool = False,
-    ) -> tuple[Float, Float]:
-        """Compute mean scores over draws of the true pose outside geometry, while the robot turns by its estimate.
-
-        Args:
-            scorer: scores views.
-            points: (W, 3) m, estimated locations in the world.
-            axes: (D, 3) directions scored at each.
-            allowed: (W, D) those that are compared.
-            chosen: rows of points (V,), and optical axes (V, 3), of the selected views.
-            progress: show a bar.
-
-        Returns:
-            (V,) of each selected view, and (V,) the highest of all compared directions at its location.
-        """
-        of_view, view_axes = chosen
-        expected, best = np.empty(len(of_view)), np.empty(len(of_view))
-        offsets, rotations = self.draws()
-        for row in tqdm(range(len(points)), desc="prior", unit="waypoint", disable=not progress):
-            views = np.flatnonzero(of_view == row)
-            directions = np.concatenate([view_axes[views], axes[allowed[row]]])
-            at = points[row] + offsets
-            free = ~scorer.localization_map.occlusion.inside_geometry(at)
-            free |= ~free.any()
-            pairs = zip(at[free], rotations[free], strict=True)
-            scores = [scorer.score_directions(point[None], directions @ turn.T)[0] for point, turn in pairs]
-            mean = np.mean(scores, axis=0)
-            expected[views], best[views] = mean[: len(views)], mean.max()
-        return expected, best
-
-
-VIEWS_PER_STEP = {"cpu": 1 << 13, "cuda": 1 << 17}  # of the progress bar, in whole waypoints
-
-SPARE = 3
-"""Views of a waypoint, beyond those asked for, whose scores are computed again: where many landmarks are in view, the
-scores of all directions are computed from other samples of them."""
-
-CONFIG = SceneConfig(occlusion_cache_bytes=1 << 30)
-
-PAN_TOLERANCE_DEG = 1e-9
-SIGHT_LINES = 1 << 24  # lines of sight tested at once
 
 
 class WhereToLook:
@@ -186,9 +110,6 @@ class WhereToLook:
             WeightsError: the weights cannot be used, or there are none.
             ConfigError: no such method, camera, occlusion, lattice or device.
         """
-        from wheretolook.scorers.registry import make_scorer
-        from wheretolook.scorers.weights import load_scorer, resolve_weights
-
         device = usable_device(device)
         camera = _described_camera(camera, fov_deg)
         axes = direction_lattice(directions, lattice)
@@ -196,7 +117,7 @@ class WhereToLook:
         mesh, depth, database = (None if file is None else Path(file) for file in (mesh, depth, database))
         options = FrameOptions(**frame)
         files = ColmapFiles(Path(path), mesh, depth, depth_scale, database, max_reprojection_error_px, options)
-        scene = Scene.of_colmap(files, camera, occlusion, CONFIG, device)
+        scene = Scene.of_colmap(files, camera, occlusion, SceneConfig(occlusion_cache_bytes=1 << 30), device)
         here = scene.localization_map
         weights = resolve_weights(method, weights, here.landmarks.features)
         if not method:
@@ -309,8 +230,8 @@ class WhereToLook:
         poses = rigid_poses(cam_from_world)
         waypoints = Waypoints.of(camera_centers(poses), names)
         rows = np.flatnonzero(usable_waypoints(self.localization_map, waypoints, skip))
-        poses = self.frame.world_from_map.apply_to_poses(poses[rows])
-        return self._explained(self._reported(waypoints, rows, poses))
+        views = reported(self.scorer, waypoints, rows, self.frame.world_from_map.apply_to_poses(poses[rows]))
+        return explained(self.reasons, views)
 
     def best(
         self,
@@ -345,98 +266,9 @@ class WhereToLook:
         if accuracy is not None:
             look = self.at_accuracy(accuracy)
             return look.best(points, n, ids=ids, heading_deg=heading_deg, progress=progress, **options)
-        request = SelectionRequest(n=n, **options)
-        axes = self._allowed(request)
         waypoints = Waypoints.of(points, ids, heading_deg)
-        rows = np.flatnonzero(usable_waypoints(self.localization_map, waypoints, request.skip))
-        waypoints = waypoints[rows]
-        allowed = self._within_pan(waypoints, axes, request)
-        waypoints = replace(waypoints, points=self.frame.world_from_map.apply(waypoints.points))
-        scores = self._candidate_scores(waypoints.points, axes, progress)
-        scores[~allowed] = -np.inf
-        if request.looks is None:
-            views = self._single_views(waypoints, axes, scores, request)
-        elif request.least_score is None:
-            views = self._view_sets(waypoints, axes, scores, request.looks, request.max_total_turn_deg, progress)
-        else:
-            views = self._sequence_with_stops(waypoints, axes, scores, request, progress)
-        if request.sigma_m or request.yaw_sigma_deg:
-            prior = PoseUncertainty(request.sigma_m or 0.0, request.yaw_sigma_deg or 0.0)
-            chosen = views.waypoint, views.axes @ self.frame.world_from_map.rotation.T
-            allowed &= scores >= -np.sort(-scores, axis=1)[:, :ALTERNATIVES][:, -1:]
-            expected, best = prior.expected_scores(self.scorer, waypoints.points, axes, allowed, chosen, progress)
-            views = replace(views, expected_score=expected, best_expected_score=best)
-        return replace(self._explained(views), waypoint=rows[views.waypoint])
-
-    def _single_views(self, waypoints: Waypoints, axes: Float, scores: Float, request: SelectionRequest) -> Views:
-        """Select the n best views at each waypoint by scores (W, D) of axes (D, 3), or the best sequence."""
-        if request.max_turn_deg is not None:
-            chosen = best_sequence(scores, _turn_limit(axes, request.max_turn_deg)).direction_ids[:, None]
-        elif request.apart_deg is not None or request.pan_deg is not None:
-            chosen = _separate_views(waypoints, axes, scores, request)
-        else:
-            chosen = np.argsort(-scores, axis=1, kind="stable")[:, : request.n + SPARE]
-        k = chosen.shape[1]
-        step = max(1, SIGHT_LINES // max(1, len(self.localization_map.landmarks)))
-        blocks = np.split(np.arange(len(waypoints)), range(step, len(waypoints), step))
-        poses = poses_looking_along(waypoints.points[:, None], axes[chosen])
-        reported = [self._reported(waypoints, np.repeat(block, k), poses[block].reshape(-1, 3, 4)) for block in blocks]
-        views = Views.concatenate(reported)
-        order = np.argsort(-views.score.reshape(-1, k), axis=1, kind="stable")[:, : request.n]
-        best = views[(np.arange(len(waypoints))[:, None] * k + order).ravel()]
-        return replace(best, rank=np.tile(np.arange(1, order.shape[1] + 1), len(waypoints)))
-
-    def _view_sets(
-        self, waypoints: Waypoints, axes: Float, scores: Float, n: int, max_turn_deg: float | None, progress: bool
-    ) -> Views:
-        """Select the n views at each waypoint with the best joint score, by scores (W, D) of axes (D, 3)."""
-        pairs = zip(waypoints.points, tqdm(scores, desc="looks", unit="waypoint", disable=not progress), strict=True)
-        sets = []
-        chosen: list[Float] = []
-        for point, values in pairs:
-            choice = axes[np.isfinite(values)]
-            sets.append(best_views(self.scorer, point, choice, values[np.isfinite(values)], n, max_turn_deg))
-            chosen.extend(choice[[*sets[-1].rows]])
-        rank = np.tile(np.arange(1, n + 1), len(sets))
-        set_scores = np.repeat([view_set.score for view_set in sets], n)
-        rows = np.repeat(np.arange(len(sets)), n)
-        poses = poses_looking_along(waypoints.points[rows], np.array(chosen))
-        return self._reported(waypoints, rows, poses, rank, set_scores)
-
-    def _sequence_with_stops(
-        self, waypoints: Waypoints, axes: Float, scores: Float, request: SelectionRequest, progress: bool
-    ) -> Views:
-        """Select the best sequence by scores (W, D) of axes (D, 3), with further looks where it scores too little."""
-        assert request.looks is not None and request.max_turn_deg is not None and request.least_score is not None
-        points = waypoints.points
-        chosen = axes[best_sequence(scores, _turn_limit(axes, request.max_turn_deg)).direction_ids]
-        config = StopConfig(request.looks, request.least_score)
-        allowed = np.isfinite(scores)
-        text = "stops" if progress else None
-        stops = stops_along(self.scorer, points, chosen, axes, config, progress=text, allowed=allowed)
-        path = PlannedPath(points, chosen, self.scorer.score(poses_looking_along(points, chosen)), np.nan, stops=stops)
-        places, rank = path.looks
-        poses = poses_looking_along(points[places], path.all_axes)
-        return self._reported(waypoints, places, poses, rank, path.scores_with_stops[places])
-
-    def _reported(
-        self,
-        waypoints: Waypoints,
-        rows: NDArray[np.int64],
-        poses: Float,
-        rank: NDArray[np.int64] | None = None,
-        set_score: Float | None = None,
-    ) -> Views:
-        """Return the views with poses (V, 3, 4) at the waypoints of rows (V,), with their scores."""
-        return replace(
-            self.scorer.report(poses),
-            cam_from_world=self.frame.world_from_map.inverse.apply_to_poses(poses),
-            frame=self.frame,
-            waypoint=rows,
-            waypoint_id=tuple(waypoints.ids[row] for row in rows),
-            rank=np.ones_like(rows) if rank is None else rank,
-            set_score=set_score,
-        )
+        request = SelectionRequest(n=n, **options)
+        return select_views(self.scorer, self.reasons, self.directions, waypoints, request, progress)
 
     def floor_plan(self, views: Views) -> Figure:
         """Draw views on a plan of the landmarks, in the map's unit, upright: a Matplotlib figure."""
@@ -451,69 +283,6 @@ class WhereToLook:
     def reasons(self) -> ReasonCounter:
         """Counts the landmarks in views that are hard to match."""
         return ReasonCounter(self.localization_map)
-
-    def _explained(self, views: Views) -> Views:
-        """Return views with the numbers of landmarks that are hard to match."""
-        step = max(1, SIGHT_LINES // max(1, len(self.localization_map.landmarks)))
-        poses = self.frame.world_from_map.apply_to_poses(views.cam_from_world)
-        counts = Views.concatenate(self.reasons.count(poses[row : row + step]) for row in range(0, len(poses), step))
-        return replace(views, **{**counts.columns, "cam_from_world": views.cam_from_world})
-
-    def _candidate_scores(self, locations: Float, axes: Float, progress: bool) -> Float:
-        """Score all directions (D, 3) at locations (L, 3), (L, D)."""
-        kind = self.localization_map.device.partition(":")[0]
-        scores = np.empty((len(locations), len(axes)))
-        step = max(1, VIEWS_PER_STEP[kind] // len(axes))
-        with tqdm(total=len(locations), desc="score", unit="waypoint", disable=not progress) as bar:
-            for begin in range(0, len(locations), step):
-                block = locations[begin : begin + step]
-                scores[begin : begin + step] = self.scorer.score_directions(block, axes)
-                bar.update(len(block))
-        return scores
-
-    def _allowed(self, request: SelectionRequest) -> Float:
-        """Return the directions within the limit on pitch, (D, 3). Raises ConfigError if they are too few."""
-        low, high = request.pitch_deg or (-90.0, 90.0)
-        pitch = np.degrees(pan_tilt_angles(self.directions)[1])
-        axes = self.directions[(pitch >= low - 1e-9) & (pitch <= high + 1e-9)]
-        needed = request.looks or request.n
-        if len(axes) < needed:
-            fix = "Ask for fewer views, score more directions, or widen the limit on pitch."
-            raise ConfigError("there are fewer directions than views", value=f"{len(axes)} for {needed}", fix=fix)
-        return axes
-
-    def _within_pan(self, waypoints: Waypoints, axes: Float, request: SelectionRequest) -> NDArray[np.bool_]:
-        """Return which of axes (D, 3) are within the limit on pan, (W, D)."""
-        if request.pan_deg is None:
-            return np.ones((len(waypoints), len(axes)), dtype=bool)
-        heading = waypoints.heading_deg(self.frame.world_from_map.rotation)
-        pan = np.degrees(pan_tilt_angles(axes)[0]) - heading[:, None]
-        low, high = request.pan_deg
-        return np.asarray((pan - low + PAN_TOLERANCE_DEG) % 360 <= high - low + 2 * PAN_TOLERANCE_DEG)
-
-
-def _separate_views(waypoints: Waypoints, axes: Float, scores: Float, request: SelectionRequest) -> NDArray[np.int64]:
-    """Return rows (W, n) of axes (D, 3) with the best scores (W, D), above -inf, that are far enough from one another.
-
-    Raises ConfigError, which names the waypoint, if there are fewer.
-    """
-    best = [np.argsort(-values, kind="stable")[: np.isfinite(values).sum()] for values in scores]
-    chosen = [separated(axes, order, request.n, request.apart_deg or 0) for order in best]
-    for row, views in enumerate(chosen):
-        if len(views) < request.n:
-            problem = f"{waypoints.label(row)} has too few views within the limits"
-            fix = "Ask for fewer views, score more directions, or widen the limits."
-            raise ConfigError(problem, path=waypoints.path, value=f"{len(views)} of {request.n}", fix=fix)
-    return np.array(chosen)
-
-
-def _turn_limit(axes: Float, max_turn_deg: float) -> TurnLimit:
-    """Return the limit for directions (D, 3). Raises ConfigError if it allows no turn and seems to be in radians."""
-    limit = TurnLimit.of(axes, max_turn_deg)
-    if 0 < max_turn_deg <= np.pi and limit.neighbours.shape[1] == 1 < len(axes):
-        problem = "max_turn_deg is in degrees, and less than the angle between any two directions"
-        raise ConfigError(problem, value=max_turn_deg, fix="Convert radians; else score more directions, or give 0.")
-    return limit
 
 
 def _described_camera(camera: Camera | str | int | None, fov_deg: float | None) -> Camera | int | None:

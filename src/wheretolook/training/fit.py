@@ -24,8 +24,7 @@ from torchmetrics.functional.classification import binary_auroc, binary_average_
 from torchmetrics.utilities.distributed import gather_all_tensors
 from tqdm.auto import tqdm
 
-from wheretolook.tracking.runs import log_metrics
-from wheretolook.tracking.store import TrackingConfig, client
+from wheretolook.tracking import TrackingConfig, client, log_metrics
 from wheretolook.training.config import FittingConfig, SharedConfig
 from wheretolook.training.data import Batch
 from wheretolook.utils.errors import ConfigError, TrackingError, WorkerError

@@ -13,7 +13,7 @@ from wheretolook.dataset.config import RELEASE_FILE
 from wheretolook.dataset.layout import Dataset, SceneFolder
 from wheretolook.features.extractor import SIFT
 from wheretolook.mapping.landmarks import read_feature_name
-from wheretolook.tracking.runs import AUC
+from wheretolook.tracking import AUC
 from wheretolook.training.config import DECIDING, SharedConfig
 from wheretolook.training.scenes import with_also
 from wheretolook.utils.errors import ConfigError, TableError

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from wheretolook.geometry.camera_turns import pan_tilt_angles
 from wheretolook.geometry.lattices import axes_of_angles
 from wheretolook.geometry.poses import (
     Float,
     camera_centers,
+    pan_tilt_angles,
     poses_looking_along,
     quaternion_from_rotation,
     rotation_from_quaternion,

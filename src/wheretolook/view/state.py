@@ -9,9 +9,8 @@ from typing import Self
 from urllib.parse import parse_qs, urlsplit
 
 import numpy as np
-from numpy.typing import NDArray
 
-from wheretolook.geometry.poses import Float, camera_centers, poses_looking_along
+from wheretolook.geometry.poses import Float, poses_looking_along
 from wheretolook.geometry.similarity import Similarity
 from wheretolook.geometry.views import Views
 from wheretolook.mapping.map_frame import IDENTITY
@@ -109,19 +108,8 @@ def _parse_value(name: str, text: str) -> object:
     raise ValueError(text)
 
 
-@dataclass(frozen=True, eq=False)
-class RecordedPath:
-    """Views along a path."""
-
-    cam_from_world: Float  # (W, 3, 4)
-    localized: NDArray[np.bool_] | None = None  # (W,) whether each view localized; None if unknown
-
-    def __len__(self) -> int:
-        return len(self.cam_from_world)
-
-
-Paths = dict[str, RecordedPath]
-"""Paths by method."""
+Paths = dict[str, Views]
+"""Views along paths by method; `good` is whether each localized, None if unknown."""
 
 
 def read_paths(path: Path, pair: int = 0, world_from_map: Similarity = IDENTITY.world_from_map) -> Paths:
@@ -135,7 +123,7 @@ def read_paths(path: Path, pair: int = 0, world_from_map: Similarity = IDENTITY.
     if path.suffix == ".parquet":
         paths = _compared_paths(path, pair)
     else:
-        paths = {"planned" if path.name == "path.csv" else path.stem: RecordedPath(Views.read(path).cam_from_world)}
+        paths = {"planned" if path.name == "path.csv" else path.stem: Views.read(path)}
     if not 1 <= len(paths) <= MAX_METHODS:
         problem = f"1 to {MAX_METHODS} methods can be shown"
         raise TableError(problem, path=path, value=len(paths), fix="Correct --pair, or leave out methods.")
@@ -147,7 +135,7 @@ def read_paths(path: Path, pair: int = 0, world_from_map: Similarity = IDENTITY.
     paths = {name: replace(along, cam_from_world=place(along.cam_from_world)) for name, along in paths.items()}
     if len(paths) == 1:
         (only,) = paths.values()
-        return {FORWARD: RecordedPath(looking_ahead(camera_centers(only.cam_from_world))), **paths}
+        return {FORWARD: Views(looking_ahead(only.positions)), **paths}
     return paths
 
 
@@ -182,7 +170,8 @@ def _compared_paths(path: Path, pair: int) -> Paths:
             rows = chosen[chosen["method"] == name]
             has_labels = "status" in rows and not (rows["status"] == UNLABELLED).any()
             # a view counts as localized within 25 cm and 2 degrees, as in compared paths
-            paths[str(name)] = RecordedPath(poses(rows), is_good(rows, 0.25, 2.0) if has_labels else None)
+            good = is_good(rows, 0.25, 2.0) if has_labels else None
+            paths[str(name)] = Views(poses(rows), method=str(name), good=good)
         return paths
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise TableError(f"no path can be read: {error}", path=path, fix=_PATH_FIX) from error

@@ -4,14 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar, Literal
+from typing import ClassVar, Literal
 
 from wheretolook.commands.options import Command
 from wheretolook.utils.errors import ConfigError, check_range
-from wheretolook.utils.processes import cores
-
-if TYPE_CHECKING:
-    from wheretolook_paper.benchmark.report import Result
 
 METHODS = ("best", "max-visibility", "max-visibility-shipped")
 
@@ -100,41 +96,11 @@ class Benchmark(Command):
             scores = Scores.of(read_poses(self.poses), read_errors(self.errors))
             results = [Result(self.errors.resolve().parent.name, self.errors.name, scores)]
         else:
-            results = self._run_scenes()
+            from wheretolook_paper.benchmark.round import run_scenes
+
+            results = run_scenes(self)
         if not results:
             print("Nothing to score yet. docs/benchmark.md explains how the benchmark's own script continues.")
             return
         print(f"\n{write_report(results, self.out)}\n\n{NOTES}\n")
         print(f"done: {self.out / SUMMARY_CSV}, {self.out / VIEWS_CSV}")
-
-    def _run_scenes(self) -> list[Result]:
-        from wheretolook.scorers.registry import check_method
-        from wheretolook.utils.devices import usable_device
-        from wheretolook_paper.benchmark.actloc_baseline import ACTLOC
-        from wheretolook_paper.benchmark.files import BenchmarkScene
-        from wheretolook_paper.benchmark.report import Result
-        from wheretolook_paper.benchmark.round import BEST, RoundConfig, SceneRound
-
-        methods = dict.fromkeys(self.methods)
-        for method in methods:
-            if method not in (BEST, ACTLOC):
-                check_method(method)
-        scenes = [BenchmarkScene.of(folder, self.mesh, self.waypoints) for folder in self.scenes]
-        config = RoundConfig(
-            self.weights,
-            self.directions,
-            self.lattice,
-            self.max_turn_deg,
-            localize=self.localizer == "sift",
-            workers=self.workers or cores(),
-            device=usable_device(self.device),
-        )
-        rounds = [SceneRound(scene, self.out / scene.name, config) for scene in scenes]
-        results: list[Result] = []
-        while rounds:
-            one = rounds.pop(0)  # so that its mesh goes when it is done
-            scores_of = {one.folder_name(method): one.run(method) for method in methods}
-            results += [Result(one.scene.name, name, scores) for name, scores in scores_of.items() if scores]
-            for line in one.messages:
-                print(f"{one.scene.name}: {line}")
-        return results

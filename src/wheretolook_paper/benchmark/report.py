@@ -23,8 +23,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from wheretolook.dataset.config import ALL, THRESHOLDS, threshold_key, threshold_label
-from wheretolook.geometry.camera_turns import pan_tilt_angles
-from wheretolook.geometry.poses import Float, camera_centers
+from wheretolook.geometry.poses import Float, camera_centers, pan_tilt_angles
 from wheretolook.utils.errors import TableError
 from wheretolook.utils.files import write_text
 from wheretolook.utils.texts import markdown_table

@@ -34,14 +34,17 @@ from wheretolook.mapping.triangulation import (
 from wheretolook.rendering.raycasting import MeshRaycaster
 from wheretolook.rendering.warp_renderer import Renderer, WarpRenderer
 from wheretolook.scenes.loading import load_mesh
+from wheretolook.scorers.registry import check_method
 from wheretolook.scorers.weights import resolve_weights
 from wheretolook.select.waypoints import Waypoints, read_waypoints
 from wheretolook.select.where_to_look import WhereToLook
+from wheretolook.utils.devices import usable_device
 from wheretolook.utils.errors import MapError, SceneError, StorageError, TableError
 from wheretolook.utils.files import ArtifactCache, atomic_folder, cache_key, fingerprint, read_image, write_bytes
 from wheretolook.utils.package import VERSION
-from wheretolook.utils.processes import WorkerPool
+from wheretolook.utils.processes import WorkerPool, cores
 from wheretolook_paper.benchmark.actloc_baseline import ACTLOC, ACTLOC_FIXED, MAX_ERROR_PX, actloc_views
+from wheretolook_paper.benchmark.command import Benchmark
 from wheretolook_paper.benchmark.files import (
     CAMERA,
     DRAWN_CAMERA,
@@ -53,7 +56,7 @@ from wheretolook_paper.benchmark.files import (
     write_errors,
     write_poses,
 )
-from wheretolook_paper.benchmark.report import Scores
+from wheretolook_paper.benchmark.report import Result, Scores
 
 POSES = "selected_gt_poses.txt"
 IMAGES = "images"
@@ -364,3 +367,30 @@ def read_rgb(path: Path) -> NDArray[np.uint8] | None:
         return np.asarray(read_image(path, cv2.IMREAD_COLOR)[:, :, ::-1], dtype=np.uint8)
     except (OSError, ValueError):
         return None
+
+
+def run_scenes(options: Benchmark) -> list[Result]:
+    """Run the benchmark in scene folders by every method, and print the messages."""
+    methods = dict.fromkeys(options.methods)
+    for method in methods:
+        if method not in (BEST, ACTLOC):
+            check_method(method)
+    scenes = [BenchmarkScene.of(folder, options.mesh, options.waypoints) for folder in options.scenes]
+    config = RoundConfig(
+        options.weights,
+        options.directions,
+        options.lattice,
+        options.max_turn_deg,
+        localize=options.localizer == "sift",
+        workers=options.workers or cores(),
+        device=usable_device(options.device),
+    )
+    rounds = [SceneRound(scene, options.out / scene.name, config) for scene in scenes]
+    results: list[Result] = []
+    while rounds:
+        one = rounds.pop(0)  # so that its mesh goes when it is done
+        scores_of = {one.folder_name(method): one.run(method) for method in methods}
+        results += [Result(one.scene.name, name, scores) for name, scores in scores_of.items() if scores]
+        for line in one.messages:
+            print(f"{one.scene.name}: {line}")
+    return results

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, ClassVar
 from wheretolook.commands.options import DatasetOptions, Log
 from wheretolook.dataset.dataset_lock import reads_dataset
 from wheretolook.figures import KINDS
-from wheretolook.tracking.store import TrackingConfig
+from wheretolook.tracking import TrackingConfig
 from wheretolook.utils.errors import ConfigError, MissingRunError
 
 if TYPE_CHECKING:

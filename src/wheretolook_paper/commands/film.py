@@ -3,43 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.style import context
-from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
-from wheretolook.figures.style import BLUE, GREEN, RC, VERMILION, Style, frame, new_figure
+from wheretolook.figures.floor_plan import BLUE, RC, VERMILION, frame, new_figure
 from wheretolook.geometry.camera import Camera
-from wheretolook.geometry.poses import camera_centers
+from wheretolook.geometry.views import Views
 from wheretolook.planning.config import FORWARD
 from wheretolook.utils.errors import ConfigError
 from wheretolook.view import drawing
 from wheretolook.view.drawing import VisibleLandmarks, frustum_segments
-from wheretolook.view.state import RecordedPath, ViewState
+from wheretolook.view.state import ViewState
 from wheretolook.view.viewed_map import ViewedMap
 from wheretolook_paper.figures.animation import pixels_of, save_moving
 from wheretolook_paper.figures.dollhouse import Dollhouse, dollhouse, draw_house, draw_segments
+from wheretolook_paper.figures.style import GREEN, Style
 
 FRAME_MS = 220
 LAST_MS = 2500  # the last frame
 MIN_PROBABILITY = 0.3  # of drawn landmarks; all visible ones would cover the image
-
-
-@dataclass(frozen=True, eq=False)
-class _FilmedPath:
-    """A path with whether each of its views (W,) localizes."""
-
-    name: str
-    path: RecordedPath
-    good: NDArray[np.bool_]
-
-    @property
-    def color(self) -> str:
-        return VERMILION if self.name == FORWARD else BLUE
 
 
 def film(viewed: ViewedMap, path: Path, state: ViewState = ViewState()) -> int:
@@ -65,9 +52,9 @@ def _frames(viewed: ViewedMap, state: ViewState) -> Iterator[drawing.Rgb]:
     paths = []
     for name, path in (named[0], named[-1]):
         scores = scorer.score(path.cam_from_world)
-        good = scores >= state.threshold if path.localized is None else path.localized
-        paths.append(_FilmedPath(name, path, np.asarray(good)))
-    heights = camera_centers(paths[1].path.cam_from_world)[:, 2]
+        good = scores >= state.threshold if path.good is None else path.good
+        paths.append(replace(path, method=name, good=good))
+    heights = paths[1].positions[:, 2]
     house = dollhouse(viewed.mesh, elevation_deg=62, cut_m=float(heights.max()) + 0.3, width_px=700)
     n_frames = min(max(len(filmed.path) for filmed in paths), 60)
     for share in tqdm(np.linspace(0, 1, n_frames), desc="film", unit="frame"):
@@ -78,8 +65,8 @@ def _frames(viewed: ViewedMap, state: ViewState) -> Iterator[drawing.Rgb]:
             above = figure.add_subplot(grid[:, 0])
             draw_house(above, house, 0.35)
             for row, filmed in enumerate(paths):
-                at = round(share * (len(filmed.path) - 1))
-                pose = filmed.path.cam_from_world[at]
+                at = round(share * (len(filmed) - 1))
+                pose = filmed.cam_from_world[at]
                 _draw_path(above, house, filmed, at, viewed.camera, viewed.marker_m)
                 visible = viewed.visible_landmarks(state.method, state.occlusion, pose)
                 likely = np.nan_to_num(visible.probabilities) >= MIN_PROBABILITY
@@ -89,28 +76,32 @@ def _frames(viewed: ViewedMap, state: ViewState) -> Iterator[drawing.Rgb]:
             yield pixels_of(figure)
 
 
-def _draw_path(axes: Axes, house: Dollhouse, filmed: _FilmedPath, at: int, camera: Camera, marker_m: float) -> None:
+def _color(filmed: Views) -> str:
+    return VERMILION if filmed.method == FORWARD else BLUE
+
+
+def _draw_path(axes: Axes, house: Dollhouse, filmed: Views, at: int, camera: Camera, marker_m: float) -> None:
     """Draw the path so far, green where views localize, the rest thin, and the camera."""
-    poses = filmed.path.cam_from_world
-    centers = camera_centers(poses)
+    poses = filmed.cam_from_world
+    centers = filmed.positions
     pairs = np.stack([centers[:-1], centers[1:]], axis=1)
-    draw_segments(axes, house, pairs, colors=filmed.color, linewidths=1.0, alpha=0.5)
+    draw_segments(axes, house, pairs, colors=_color(filmed), linewidths=1.0, alpha=0.5)
     if at:
         colors = [GREEN if good else "#BBBBBB" for good in filmed.good[1 : at + 1]]
         draw_segments(axes, house, pairs[:at], colors="white", linewidths=5)
         draw_segments(axes, house, pairs[:at], colors=colors, linewidths=3)
     edges = frustum_segments(camera, poses[at : at + 1], 2.5 * marker_m)
     draw_segments(axes, house, edges, colors="white", linewidths=3.5)
-    draw_segments(axes, house, edges, colors=filmed.color, linewidths=1.8)
+    draw_segments(axes, house, edges, colors=_color(filmed), linewidths=1.8)
 
 
-def _draw_view(axes: Axes, image: drawing.Rgb, filmed: _FilmedPath, at: int) -> None:
+def _draw_view(axes: Axes, image: drawing.Rgb, filmed: Views, at: int) -> None:
     good = bool(filmed.good[at])
     color = GREEN if good else VERMILION
     axes.imshow(image)
     frame(axes, color, 4)
-    title = "looks ahead" if filmed.name == FORWARD else "selected views"
-    axes.set_title(title, fontsize=11, color=filmed.color, fontweight="bold", loc="left")
+    title = "looks ahead" if filmed.method == FORWARD else "selected views"
+    axes.set_title(title, fontsize=11, color=_color(filmed), fontweight="bold", loc="left")
     share = f"{100 * np.mean(filmed.good[: at + 1]):.0f} % so far"
     verdict = f"localized: {share}" if good else f"LOST, localized: {share}"
     box = {"boxstyle": "square,pad=0.3", "facecolor": color, "edgecolor": "none"}

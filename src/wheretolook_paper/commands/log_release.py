@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, ClassVar
 from wheretolook.commands.options import DatasetOptions, Log
 from wheretolook.dataset.config import RELEASE_FILE
 from wheretolook.dataset.dataset_lock import reads_dataset
-from wheretolook.tracking.runs import ui_command
-from wheretolook.tracking.store import TrackingConfig, check_store
+from wheretolook.tracking import TrackingConfig, check_store, ui_command
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.files import temporary_folder
 from wheretolook_paper.commands.figures import FiguresConfig

@@ -11,7 +11,7 @@ from wheretolook.commands.options import Experiment, Log, Progress, ignore_progr
 from wheretolook.dataset.config import RELEASE_FILE
 from wheretolook.dataset.dataset_lock import changing, reading, reads_dataset
 from wheretolook.evaluation.config import EvaluateConfig
-from wheretolook.tracking.store import check_store
+from wheretolook.tracking import check_store
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.files import check_folder_name, copy_file, safe_child, write_text
 

@@ -16,13 +16,13 @@ from wheretolook.dataset.viewpoint_files import has_matches, read_table
 from wheretolook.dataset.viewpoint_table import is_good, poses
 from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.evaluation.results import SCORES_MD, SCORES_PNG, VARIANTS_CSV, main_rows, read_scores, results_folder
-from wheretolook.figures.style import save_figure, scene_label
+from wheretolook.figures.floor_plan import save_figure
 from wheretolook.geometry.poses import Float, camera_centers, poses_looking_along
+from wheretolook.geometry.views import Views
 from wheretolook.looks.selection import SetScoreModel, candidate_views, score_of_set
-from wheretolook.planning.routes import PathView
 from wheretolook.scorers.base import Scorer
 from wheretolook.scorers.weights import load_scorer, resolve_weights
-from wheretolook.tracking.store import TrackingConfig, kept_if_not_logged
+from wheretolook.tracking import TrackingConfig, kept_if_not_logged
 from wheretolook.utils.files import write_text
 from wheretolook_paper.evaluation.label_report import label_markdown, label_summary
 from wheretolook_paper.evaluation.looks import (
@@ -50,6 +50,7 @@ from wheretolook_paper.figures.overview import (
 )
 from wheretolook_paper.figures.paths import FRAME_MS, film_frames, methods_figure, still_figure
 from wheretolook_paper.figures.scores import calibration_figure, occlusion_figure, regret_figure, score_figure
+from wheretolook_paper.figures.style import scene_label
 from wheretolook_paper.styles import in_table_order, method_style
 
 
@@ -86,7 +87,7 @@ def report_scores(folder: Path, table: pd.DataFrame, calibration: pd.DataFrame, 
     return text
 
 
-def draw_path(views: dict[str, list[PathView]], landmarks: Float, title: str, folder: Path, film: str) -> list[str]:
+def draw_path(views: dict[str, Views], landmarks: Float, title: str, folder: Path, film: str) -> list[str]:
     """Draw the last of several methods' planned paths, and all side by side; return the names of the files.
 
     Args:

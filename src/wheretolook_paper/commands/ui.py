@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from http.client import HTTPConnection
 
 from wheretolook.commands.options import Command
-from wheretolook.tracking.store import TrackingConfig
+from wheretolook.tracking import TrackingConfig
 from wheretolook.utils.errors import ConfigError, MissingRunError
 from wheretolook_paper.experiment_notes import experiment_link, first_view
 
@@ -86,7 +86,7 @@ def comparisons(tracking: TrackingConfig, server: str) -> dict[str, str]:
 
     Evaluations are first. Raises MissingRunError if there is no store.
     """
-    from wheretolook.tracking.store import client
+    from wheretolook.tracking import client
 
     if not (tracking.root / "mlflow.db").is_file():
         fix = "Run a stage first, such as `wheretolook log-release`, or name the folder: --tracking.folder FOLDER."

@@ -8,8 +8,7 @@ from typing import Any
 
 import pandas as pd
 
-from wheretolook.tracking.runs import NestedRun, Tags, log, log_nested, start_run
-from wheretolook.tracking.store import TrackingConfig
+from wheretolook.tracking import NestedRun, Tags, TrackingConfig, log, log_nested, start_run
 from wheretolook.utils.files import write_text
 
 

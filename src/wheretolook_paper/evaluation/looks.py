@@ -26,9 +26,8 @@ from wheretolook.localization.config import LocalizerConfig
 from wheretolook.localization.estimation import PoseEstimator, SingleViewPoses
 from wheretolook.localization.rig import Look, rig_of
 from wheretolook.localization.rig_localization import JointLocalization, JointLocalizer
-from wheretolook.looks.selection import CandidateViews, Rotations, SetScoreModel, select_views
-from wheretolook.tracking.runs import BEST_TAG, NestedRun
-from wheretolook.tracking.store import TrackingConfig
+from wheretolook.looks.selection import Detections, Rotations, SetScoreModel, select_views
+from wheretolook.tracking import BEST_TAG, NestedRun, TrackingConfig
 from wheretolook.utils.errors import TableError
 from wheretolook.utils.files import write_text
 from wheretolook.utils.texts import markdown_table
@@ -181,13 +180,7 @@ def evenly_spread(directions: Float, n: int, first: int) -> list[int]:
 
 
 def choose_set(
-    strategy: str,
-    n: int,
-    axes: Float,
-    scores: Float,
-    views: CandidateViews,
-    certain: CandidateViews,
-    rng: np.random.Generator,
+    strategy: str, n: int, axes: Float, scores: Float, views: Detections, certain: Detections, rng: np.random.Generator
 ) -> list[int]:
     """Return the rows of n views along axes (D, 3) with scores (D,) that a strategy of the tables chooses."""
     if strategy == "random":

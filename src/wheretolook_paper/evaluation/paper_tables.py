@@ -11,8 +11,7 @@ import pandas as pd
 
 from wheretolook.dataset.config import ALL, THRESHOLDS, threshold_key, threshold_label
 from wheretolook.evaluation.results import RELEASED_DIVISOR, main_rows, methods_of
-from wheretolook.tracking.runs import newest_artifact
-from wheretolook.tracking.store import TrackingConfig
+from wheretolook.tracking import TrackingConfig, newest_artifact
 from wheretolook.utils.files import write_text
 from wheretolook.utils.texts import markdown_table
 from wheretolook_paper.evaluation.score_report import comparisons_markdown

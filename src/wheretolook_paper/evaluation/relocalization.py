@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,8 +16,10 @@ import pandas as pd
 from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
+from wheretolook.commands.options import Log, extractor_of, open_scene
+from wheretolook.dataset.layout import Dataset, SceneFolder
 from wheretolook.dataset.scene import Scene
-from wheretolook.dataset.viewpoint_table import LOCALIZED, is_good
+from wheretolook.dataset.viewpoint_table import LOCALIZED, is_good, poses
 from wheretolook.evaluation.statistics import ClusterBootstrap, precision_area
 from wheretolook.features.extractor import ExtractorConfig
 from wheretolook.geometry.poses import Float, camera_centers
@@ -25,10 +28,18 @@ from wheretolook.localization.localizer import Localizer
 from wheretolook.localization.rig import Look, rig_of
 from wheretolook.localization.rig_localization import JointLocalization
 from wheretolook.looks.next_look import NextLookSelector, angles_to_views, mean_scores_by_pitch
+from wheretolook.planning.scene_map import scene_scorer
 from wheretolook.scorers.base import Scorer
+from wheretolook.scorers.weights import resolve_weights
+from wheretolook.tracking import BEST_TAG, NestedRun, kept_if_not_logged
+from wheretolook.utils.files import ArtifactCache, atomic_write, cache_key, fingerprint, write_text
 from wheretolook.utils.texts import markdown_table
-from wheretolook_paper.evaluation.comparison import interval_text
+from wheretolook_paper.commands.relocalize import FOLDER, Relocalize
+from wheretolook_paper.evaluation.comparison import interval_text, log_comparison
 from wheretolook_paper.evaluation.looks import SET_COLUMNS, set_label
+from wheretolook_paper.figures.animation import save_moving
+from wheretolook_paper.figures.dollhouse import dollhouse
+from wheretolook_paper.figures.looks import FRAME_MS, LAST_MS, film_frames, story_of_steps
 
 COLUMNS = ("location_id", "policy", "n_looks", "hypothesis", *SET_COLUMNS[2:-1])
 """Columns of `simulate`: `hypothesis` is 0 for the chosen pose, and counts its rivals; others are those of
@@ -117,15 +128,15 @@ class SimulatedRobot:
     ) -> pd.DataFrame:
         """Turn by each policy at places, by their id, with poses (D, 3, 4); return `COLUMNS` after each view."""
         rows: list[tuple[Any, ...]] = []
-        for number, poses in tqdm(places.items(), desc=title, unit="place"):
-            place = Place(self, poses)
-            first = int(np.random.default_rng([seed, number]).integers(len(poses)))
+        for number, cam_from_world in tqdm(places.items(), desc=title, unit="place"):
+            place = Place(self, cam_from_world)
+            first = int(np.random.default_rng([seed, number]).integers(len(cam_from_world)))
             for policy in policies:
                 earlier = place.turn(policy, first, n_views, np.random.default_rng([seed, number, 1]))
                 for n in range(1, len(earlier) + 1):
                     result = place.localize(earlier[:n])
                     for k, pose in enumerate((result, *result.rivals)):
-                        label = set_label(pose, poses[first : first + 1])
+                        label = set_label(pose, cam_from_world[first : first + 1])
                         rows.append((number, policy, n, k, *label))
         return pd.DataFrame(rows, columns=list(COLUMNS))
 
@@ -179,3 +190,93 @@ def summary_markdown(summary: pd.DataFrame, confidence: float) -> str:
         lines.append([str(row["policy"]), str(row["places"]), *cells, views, *last, f"{row['precision_area']:.3f}"])
     head = f"Share of places whose pose is right, in % [95 % interval over places]; stop at a confidence of {confidence:g}."
     return f"{head}\n\n{markdown_table(heads, lines)}\n"
+
+
+def compare_policies(options: Relocalize, dataset: Dataset, scenes: Sequence[SceneFolder], log: Log) -> pd.DataFrame:
+    """Simulate in scenes; write and log `<dataset>/results/relocalize.*`, and a film if asked. Returns `summarize`."""
+    tables = [_simulated(options, dataset, files, log).assign(scene=files.name) for files in scenes]
+    table = pd.concat(tables, ignore_index=True)
+    summary = summarize(table, options.confidence)
+    results = dataset.root / "results"
+    markdown = summary_markdown(summary, options.confidence)
+    write_text(results / f"{FOLDER}.csv", summary.to_csv(index=False, float_format="%.6g", lineterminator="\n"))
+    write_text(results / f"{FOLDER}.md", markdown)
+    with atomic_write(results / FOLDER / "poses.parquet") as partial:
+        table.to_parquet(partial, index=False)
+    with kept_if_not_logged(f"the comparison in {results}"):
+        _log(options, dataset, summary, results)
+    log(markdown)
+    log(f"-> {results / FOLDER}.csv, {FOLDER}.md; every pose in {results / FOLDER}")
+    if options.film is not None:
+        _film(options, dataset, table, options.film, log)
+    return summary
+
+
+def _robot(options: Relocalize, dataset: Dataset, files: SceneFolder, log: Log) -> SimulatedRobot:
+    scene = open_scene(options, files)
+    weights = resolve_weights(options.method, options.weights, dataset=dataset, log=log)
+    extractor = extractor_of(files, options.extractor)
+    return SimulatedRobot(scene, scene_scorer(scene, options.method, weights), extractor)
+
+
+def _places(options: Relocalize, files: SceneFolder) -> dict[int, Float]:
+    """Return poses (D, 3, 4) of the sampled views at random locations, by the location's id."""
+    table = files.read_table()
+    of_view = table["location_id"].to_numpy(np.int64)
+    ids = np.random.default_rng(options.seed).permutation(np.unique(of_view))[: options.places]
+    cam_from_world = poses(table)
+    return {int(number): cam_from_world[of_view == number] for number in ids}
+
+
+def _simulated(options: Relocalize, dataset: Dataset, files: SceneFolder, log: Log) -> pd.DataFrame:
+    """Simulate in a scene, or read the cached result."""
+    weights = resolve_weights(options.method, options.weights, dataset=dataset, log=log)
+    inputs = [fingerprint(path) for path in (files.mesh, files.landmarks, files.table, weights) if path is not None]
+    settings: list[Any] = [options.places, options.views, options.policies, options.method, options.seed]
+    cache = ArtifactCache(dataset.root / "results" / FOLDER / files.name, cache_key("1", [settings, inputs]), "poses")
+    stored = cache.load("poses.parquet")
+    if stored is not None:
+        return stored["poses.parquet"]
+    robot = _robot(options, dataset, files, log)
+    table = robot.simulate(_places(options, files), options.policies, options.views, options.seed, files.name)
+    return cache.store({"poses.parquet": table})["poses.parquet"]
+
+
+def _log(options: Relocalize, dataset: Dataset, summary: pd.DataFrame, results: Path) -> None:
+    """Log the comparison as a run with its files, and a nested run for each policy."""
+    params = {"dataset": dataset.name, "places": options.places, "views": options.views, "method": options.method}
+    params |= {"confidence": options.confidence, "seed": options.seed}
+    rows = summary.set_index("policy").to_dict("index")
+    best = max(rows, key=lambda policy: float(rows[policy]["right"]) if policy != "known" else -1.0)
+    metrics = {str(name): float(value) for name, value in rows[best].items()}
+    nested = [
+        NestedRun(str(policy), {**params, "policy": policy}, {str(k): float(v) for k, v in row.items()})
+        for policy, row in rows.items()
+    ]
+    files = [results / f"{FOLDER}.csv", results / f"{FOLDER}.md"]
+    about = {BEST_TAG: str(best)}
+    log_comparison(options.tracking, "all policies", FOLDER, params, metrics, nested, files, about=about)
+
+
+def _film(options: Relocalize, dataset: Dataset, table: pd.DataFrame, path: Path, log: Log) -> None:
+    """Film the place where the last policy succeeds with the lowest probability of the first view's pose."""
+    last = table[(table["policy"] == options.policies[-1]) & (table["hypothesis"] == 0)]
+    right = last[is_good(last) & (last["n_looks"] == options.views)].set_index(["scene", "location_id"]).index
+    first = last[last["n_looks"] == 1].set_index(["scene", "location_id"])
+    lost = first[first.index.isin(right) & ~is_good(first)]
+    if lost.empty:
+        log("no film: the last policy localizes no place where the first view fails")
+        return
+    scene, number = lost["n_inliers"].idxmax()
+    files = dataset.scene(str(scene))
+    robot = _robot(options, dataset, files, log)
+    place = Place(robot, _places(options, files)[int(number)])
+    start = int(np.random.default_rng([options.seed, int(number)]).integers(len(place.cam_from_world)))
+    rows = place.turn(options.policies[-1], start, options.views, np.random.default_rng([options.seed, int(number), 1]))
+    images = np.stack([place.image(row) for row in rows])
+    results = [place.localize(rows[:n]) for n in range(1, len(rows) + 1)]
+    story = story_of_steps(files.camera, place.cam_from_world[rows], images, results)
+    height = float(camera_centers(story.cam_from_world)[0, 2])
+    house = dollhouse(robot.scene.mesh, elevation_deg=62, cut_m=height + 0.3, width_px=700)
+    save_moving((frame for frame, _ in film_frames(story, house)), FRAME_MS, path, LAST_MS)
+    log(f"film of {scene}, location {number} -> {path}")

@@ -13,8 +13,9 @@ from matplotlib.ticker import MaxNLocator, NullLocator
 
 from wheretolook.dataset.config import ALL, THRESHOLDS, threshold_key, threshold_label
 from wheretolook.dataset.viewpoint_table import POSITIVE
-from wheretolook.figures.style import INK, RC, Style, new_figure, scene_label
+from wheretolook.figures.floor_plan import INK, RC, new_figure
 from wheretolook_paper.evaluation.label_report import LabelSummary, threshold_sentence
+from wheretolook_paper.figures.style import Style, scene_label
 
 SHADES = ("#08306b", "#86bcdc")
 """Colours of the finest and the coarsest threshold, distinct in greyscale."""

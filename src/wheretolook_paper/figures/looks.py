@@ -14,7 +14,7 @@ from matplotlib.style import context
 from numpy.typing import ArrayLike
 
 from wheretolook.dataset.config import THRESHOLDS
-from wheretolook.figures.style import BLUE, GREEN, GREY, INK, ORANGE, PURPLE, RC, SKY, VERMILION, Style, new_figure
+from wheretolook.figures.floor_plan import BLUE, GREY, INK, RC, VERMILION, new_figure
 from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.poses import Float, pose_error
 from wheretolook.localization.confidence import ConfidenceModel
@@ -26,6 +26,7 @@ from wheretolook.view.drawing import frustum_segments
 from wheretolook_paper.evaluation.looks import TOGETHER
 from wheretolook_paper.figures.animation import Pixels, pixels_of
 from wheretolook_paper.figures.dollhouse import Dollhouse, draw_house, draw_segments
+from wheretolook_paper.figures.style import GREEN, ORANGE, PURPLE, SKY, Style
 
 _STYLES: dict[str, tuple[str, str, str]] = {
     TOGETHER: ("chosen jointly", BLUE, "o"),

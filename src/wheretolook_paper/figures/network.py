@@ -16,11 +16,11 @@ from matplotlib.patheffects import withStroke
 from matplotlib.style import context
 from numpy.typing import ArrayLike, NDArray
 
-from wheretolook.figures.style import BLUE, INK, ORANGE, PRINT, TWO_COLUMNS_IN, VERMILION, Style, frame, new_figure
-from wheretolook.geometry.camera_turns import pan_tilt_angles
-from wheretolook.geometry.poses import Float
+from wheretolook.figures.floor_plan import BLUE, INK, VERMILION, frame, new_figure
+from wheretolook.geometry.poses import Float, pan_tilt_angles
 from wheretolook.inputs.channels import PAPER_VARIANTS
 from wheretolook_paper.figures.overview import View
+from wheretolook_paper.figures.style import ORANGE, PRINT, TWO_COLUMNS_IN, Style
 
 _COLUMNS = 12  # of a hidden layer's values
 

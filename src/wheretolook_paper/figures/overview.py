@@ -15,10 +15,10 @@ from matplotlib.style import context
 from numpy.typing import NDArray
 
 from wheretolook.dataset.viewpoint_table import LOCALIZED, UNLABELLED, is_good, poses
-from wheretolook.figures.style import BLUE, INK, RC, VERMILION, Style, frame, new_figure
-from wheretolook.geometry.camera_turns import pan_tilt_angles
-from wheretolook.geometry.poses import Float
+from wheretolook.figures.floor_plan import BLUE, INK, RC, VERMILION, frame, new_figure
+from wheretolook.geometry.poses import Float, pan_tilt_angles
 from wheretolook_paper.figures.dollhouse import Dollhouse, draw_house
+from wheretolook_paper.figures.style import Style
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -14,13 +14,14 @@ from numpy.typing import NDArray
 
 from wheretolook.dataset.config import ALL
 from wheretolook.dataset.layout import Dataset
-from wheretolook.figures.style import BLUE, GREY, INK, RC, VERMILION, Style, frame, new_figure, scene_label
-from wheretolook.geometry.poses import Float
-from wheretolook.planning.routes import PathView
+from wheretolook.figures.floor_plan import BLUE, GREY, INK, RC, VERMILION, frame, new_figure
+from wheretolook.geometry.poses import Float, poses_looking_along
+from wheretolook.geometry.views import Views
 from wheretolook.planning.view_sequence import lengths_along
 from wheretolook.utils.errors import MissingRunError
 from wheretolook.utils.texts import counted, markdown_table, score_text
 from wheretolook_paper.figures.animation import Pixels, pixels_of
+from wheretolook_paper.figures.style import Style, scene_label
 from wheretolook_paper.styles import method_style
 
 FILLED = {"greedy": "full", "with stops": "left"}
@@ -84,27 +85,27 @@ _ARROW: Style = {"arrowstyle": "-|>", "color": INK, "linewidth": 0.9, "shrinkA":
 _NUMBER: Style = {"boxstyle": "circle,pad=0.15", "facecolor": PATH, "edgecolor": "white"}
 
 
-def film_frames(views: Sequence[PathView], landmarks: Float) -> Iterator[Pixels]:
+def film_frames(views: Views, landmarks: Float) -> Iterator[Pixels]:
     """Draw one frame (H, W, 3) per view: its image with visible landmarks, the map, and the score along the path.
 
     `landmarks` (N, 3) m are those of the map; there is at least one view.
     """
     with context(RC):
-        for number, view in enumerate(views):
+        for number in range(len(views)):
             figure = new_figure(9.6, 4.4)
             grid = figure.add_gridspec(2, 2, width_ratios=(1.5, 1.0), height_ratios=(1.7, 1.0))
-            _draw_view(figure.add_subplot(grid[:, 0]), view)
+            _draw_view(figure.add_subplot(grid[:, 0]), views, number)
             draw_path(figure.add_subplot(grid[0, 1]), views, landmarks, number)
             _draw_scores(figure.add_subplot(grid[1, 1]), views, number)
             yield pixels_of(figure)
 
 
-def still_figure(views: Sequence[PathView], landmarks: Float, title: str = "") -> Figure:
+def still_figure(views: Views, landmarks: Float, title: str = "") -> Figure:
     """Draw a path from above, its score, and some evenly spread views of it.
 
     `landmarks` (N, 3) m are those of the map; there is at least one view.
     """
-    own = np.array([number for number, view in enumerate(views) if view.look == 1])
+    own = np.flatnonzero(views.rank == 1)
     shown = own[np.unique(np.linspace(0, len(own) - 1, 5).round().astype(int))].tolist()
     with context(RC):
         figure = new_figure(2.5 * max(4, len(shown)), 5.8)
@@ -116,11 +117,11 @@ def still_figure(views: Sequence[PathView], landmarks: Float, title: str = "") -
         _draw_scores(figure.add_subplot(above[1]), views, None, shown)
         cells = grid[1].subgridspec(1, len(shown))
         for column, number in enumerate(shown):
-            _draw_view(figure.add_subplot(cells[column]), views[number], f"{column + 1}: ")
+            _draw_view(figure.add_subplot(cells[column]), views, number, f"{column + 1}: ")
         return figure
 
 
-def methods_figure(paths: Mapping[str, Sequence[PathView]], landmarks: Float) -> Figure:
+def methods_figure(paths: Mapping[str, Views], landmarks: Float) -> Figure:
     """Draw the paths of several methods side by side from above, with viewing directions (paper, Sec. 4.3).
 
     `paths` maps the name of each method to the views along its path; `landmarks` (N, 3) m.
@@ -129,35 +130,41 @@ def methods_figure(paths: Mapping[str, Sequence[PathView]], landmarks: Float) ->
         figure = new_figure(3.9 * len(paths), 4.2)
         for axes, (name, views) in zip(figure.subplots(1, len(paths), squeeze=False)[0], paths.items(), strict=True):
             draw_path(axes, views, landmarks)
-            n_visible = np.mean([len(view.pixels) for view in views])
+            n_visible = np.mean([len(pixels) for pixels in views.pixels])
             axes.set_title(f"{method_style(name).label}\n{n_visible:,.0f} landmarks in view on average", fontsize=10)
         return figure
 
 
-def _draw_view(axes: Axes, view: PathView, prefix: str = "") -> None:
-    width, height = view.size_px
-    if view.rgb is not None:
-        axes.imshow(view.rgb, extent=(0, width, height, 0))
-    axes.scatter(view.pixels[:, 0], view.pixels[:, 1], s=3, color=LANDMARKS, linewidths=0)
+def _draw_view(axes: Axes, views: Views, number: int, prefix: str = "") -> None:
+    assert views.camera is not None
+    width, height = views.camera.width, views.camera.height
+    pixels, score = views.pixels[number], views.score[number]
+    if views.images is not None:
+        axes.imshow(views.images[number], extent=(0, width, height, 0))
+    axes.scatter(pixels[:, 0], pixels[:, 1], s=3, color=LANDMARKS, linewidths=0)
     axes.set(xlim=(0, width), ylim=(height, 0), aspect="equal", anchor="N")
     frame(axes, linewidth=0.8)
-    stop = f"view {view.look} of {view.n_looks}: " if view.n_looks > 1 else ""
-    score = "" if np.isnan(view.score) else f", score {score_text(view.score)}"
-    axes.set_title(f"{prefix}{stop}{counted(len(view.pixels), 'landmark')}{score}", fontsize=9)
+    n_views = _views_there(views)[number]
+    stop = f"view {views.rank[number]} of {n_views}: " if n_views > 1 else ""
+    text = "" if np.isnan(score) else f", score {score_text(float(score))}"
+    axes.set_title(f"{prefix}{stop}{counted(len(pixels), 'landmark')}{text}", fontsize=9)
 
 
-def draw_path(
-    axes: Axes, views: Sequence[PathView], landmarks: Float, number: int | None = None, shown: Sequence[int] = ()
-) -> None:
+def _views_there(views: Views) -> NDArray[np.int64]:
+    """Return the number (V,) of views at each view's position."""
+    return np.bincount(views.waypoint)[views.waypoint]
+
+
+def draw_path(axes: Axes, views: Views, landmarks: Float, number: int | None = None, shown: Sequence[int] = ()) -> None:
     """Draw landmarks (N, 2 or 3) and path from above, arrows along it or at view `number`, numbers at views `shown`."""
-    positions = np.array([view.position for view in views])
+    positions = views.positions
     xy = positions[:, :2]
     low, high = np.percentile(landmarks[:, :2], (1, 99), axis=0)
     low = np.minimum(low, xy.min(0))
     high = np.maximum(high, xy.max(0))
     axes.scatter(landmarks[:, 0], landmarks[:, 1], s=0.5, color="#9a9a9a", linewidths=0, rasterized=True)
     axes.plot(*xy.T, color=PATH, linewidth=2.2, zorder=3)
-    stops = xy[[view.look == 1 < view.n_looks for view in views]]
+    stops = xy[(views.rank == 1) & (_views_there(views) > 1)]
     axes.plot(*stops.T, markersize=7, zorder=3.5, **_STOP)
     along = lengths_along(positions)
     arrows = np.unique(np.searchsorted(along, np.linspace(0, along[-1], 12) - 1e-9)).tolist()
@@ -166,19 +173,19 @@ def draw_path(
         arrows = [number]
         length *= 2
     for at in arrows:
-        axes.annotate("", xy[at] + views[at].axis[:2] * length, xy[at], arrowprops=_ARROW, zorder=4)
+        axes.annotate("", xy[at] + views.axes[at, :2] * length, xy[at], arrowprops=_ARROW, zorder=4)
     for label, at in enumerate(shown, 1):
         axes.annotate(str(label), xy[at], fontsize=9, color="white", ha="center", va="center", bbox=_NUMBER, zorder=5)
     axes.set(xlim=(low[0] - margin, high[0] + margin), ylim=(low[1] - margin, high[1] + margin), aspect="equal")
     axes.set(xlabel="x (m)", ylabel="y (m)")
 
 
-def _draw_scores(axes: Axes, views: Sequence[PathView], number: int | None, shown: Sequence[int] = ()) -> None:
+def _draw_scores(axes: Axes, views: Views, number: int | None, shown: Sequence[int] = ()) -> None:
     """Draw the score along the path, with a mark at view `number` and numbers at views `shown`."""
-    along = lengths_along(np.array([view.position for view in views]))
-    scores = np.array([view.score for view in views])
-    joint = np.array([view.together for view in views])
-    own = np.array([view.look == 1 for view in views])
+    along = lengths_along(views.positions)
+    scores = views.score
+    joint = np.where(_views_there(views) > 1, views.set_score, np.nan)
+    own = views.rank == 1
     axes.plot(along[own], scores[own], color=PATH, linewidth=1.4)
     stops = own & np.isfinite(joint)
     if stops.any():
@@ -248,8 +255,8 @@ def _draw_scene(figure: Any, table: pd.DataFrame, landmarks: Float, pictures: Pi
         # three views of a path are shown with their photographs
         shown = np.unique(np.linspace(0, len(rows) - 1, 3).round().astype(int)).tolist()
         at = rows[POSITION].to_numpy()
-        of_rows = zip(at, rows[AXIS].to_numpy(), strict=True)
-        views = [PathView(place, axis, np.nan, np.empty((0, 2)), (0, 0), None) for place, axis in of_rows]
+        one = np.ones(len(rows), dtype=np.int64)
+        views = Views(poses_looking_along(at, rows[AXIS].to_numpy()), waypoint=np.arange(len(rows)), rank=one)
         draw_path(axes, views, landmarks, shown=shown)
         axes.set(xlabel=f"x ({unit})", ylabel=f"y ({unit})")
         axes.set_title(f"{method_style(str(method)).label}\n{_summary(rows)}", fontsize=10)

@@ -13,22 +13,13 @@ from matplotlib.style import context
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from wheretolook.figures.style import (
-    BLUE,
-    INK,
-    ONE_COLUMN_IN,
-    ORANGE,
-    PRINT,
-    TWO_COLUMNS_IN,
-    VERMILION,
-    frame,
-    new_figure,
-)
+from wheretolook.figures.floor_plan import BLUE, INK, VERMILION, frame, new_figure
 from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.lattices import fibonacci_sphere
 from wheretolook.geometry.poses import Float
 from wheretolook.view.drawing import frustum_corners, frustum_segments
 from wheretolook_paper.figures.dollhouse import Dollhouse, draw_house, draw_points, draw_segments
+from wheretolook_paper.figures.style import ONE_COLUMN_IN, ORANGE, PRINT, TWO_COLUMNS_IN
 
 
 @dataclass(frozen=True, eq=False)

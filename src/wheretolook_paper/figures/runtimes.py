@@ -16,7 +16,8 @@ from matplotlib.patches import Patch
 from matplotlib.style import context
 from matplotlib.ticker import EngFormatter, LogLocator, NullFormatter, NullLocator
 
-from wheretolook.figures.style import BLUE, GREEN, INK, PURPLE, RC, SKY, VERMILION, Style, new_figure
+from wheretolook.figures.floor_plan import BLUE, INK, RC, VERMILION, new_figure
+from wheretolook_paper.figures.style import GREEN, PURPLE, SKY, Style
 
 COUNTS = "counts alone"
 EVERYTHING = "occlusion, counts, best 100"

@@ -15,24 +15,11 @@ from matplotlib.style import context
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, cKDTree
 
-from wheretolook.figures.style import (
-    BLUE,
-    GREEN,
-    GRID,
-    INK,
-    ORANGE,
-    PRINT,
-    RC,
-    SKY,
-    TWO_COLUMNS_IN,
-    VERMILION,
-    Style,
-    new_figure,
-)
-from wheretolook.geometry.camera_turns import pan_tilt_angles
+from wheretolook.figures.floor_plan import BLUE, INK, RC, VERMILION, new_figure
 from wheretolook.geometry.lattices import VoxelGrid, azimuth_elevation_lattice, fibonacci_sphere, released_lattice
-from wheretolook.geometry.poses import Float
+from wheretolook.geometry.poses import Float, pan_tilt_angles
 from wheretolook_paper.figures.dollhouse import Dollhouse, draw_house, draw_points, draw_segments
+from wheretolook_paper.figures.style import GREEN, GRID, ORANGE, PRINT, SKY, TWO_COLUMNS_IN, Style
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,10 +16,11 @@ from matplotlib.ticker import MaxNLocator
 
 from wheretolook.dataset.config import ALL, threshold_label
 from wheretolook.evaluation.results import ORACLE, is_random, main_rows, methods_of, reference_of, threshold_keys
-from wheretolook.figures.style import GREY, INK, PRINT, RC, TWO_COLUMNS_IN, Style, new_figure
+from wheretolook.figures.floor_plan import GREY, INK, RC, new_figure
 from wheretolook.geometry.poses import Float
 from wheretolook.scorers.registry import find
 from wheretolook_paper.evaluation.paper_tables import PAPER
+from wheretolook_paper.figures.style import PRINT, TWO_COLUMNS_IN, Style
 from wheretolook_paper.styles import STYLES, method_group, method_style
 
 _MAX_METHODS = {"Fisher": 3, "probes": 0}  # the best methods of a group that a figure shows; all of other groups

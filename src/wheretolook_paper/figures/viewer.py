@@ -8,11 +8,12 @@ import numpy as np
 import open3d as o3d
 from matplotlib.colors import to_rgb
 
-from wheretolook.figures.style import BLUE, ORANGE
+from wheretolook.figures.floor_plan import BLUE
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.mesh import TexturedMesh, cut_above
 from wheretolook.geometry.poses import Float
 from wheretolook.view.drawing import frustum_segments
+from wheretolook_paper.figures.style import ORANGE
 
 
 def show_scene(mesh: TexturedMesh, landmarks: Float, cameras: Float | None, cut_m: float = np.inf) -> None:

@@ -18,8 +18,7 @@ from scipy.spatial import cKDTree
 from tqdm.auto import tqdm
 
 from wheretolook.dataset.viewpoint_table import pose_columns
-from wheretolook.geometry.camera_turns import pan_tilt_angles
-from wheretolook.geometry.poses import Float, poses_looking_along
+from wheretolook.geometry.poses import Float, pan_tilt_angles, poses_looking_along
 from wheretolook.planning.config import FORWARD
 from wheretolook.planning.routes import PlannedPath
 from wheretolook.planning.rrt import plan_path
@@ -33,8 +32,7 @@ from wheretolook.planning.view_sequence import (
     lengths_along,
 )
 from wheretolook.planning.viewpoint_map import ViewpointMap
-from wheretolook.space.free_space import FreeSpace
-from wheretolook.space.mapped_space import MappedSpace
+from wheretolook.space.free_space import FreeSpace, MappedSpace
 from wheretolook.utils.errors import PlanningError, SceneError
 from wheretolook_paper.paths.config import PathsConfig
 

@@ -13,17 +13,17 @@ from wheretolook.dataset.config import ALL
 from wheretolook.dataset.viewpoint_table import LOCALIZED
 from wheretolook.evaluation.statistics import ClusterBootstrap, divide
 from wheretolook.planning.config import FORWARD
-from wheretolook.tracking.runs import (
+from wheretolook.tracking import (
     ALL_METHODS,
     BEST_TAG,
     FINGERPRINT_TAG,
     NestedRun,
     Tags,
+    TrackingConfig,
     fingerprint_of,
     joined,
     logged_last,
 )
-from wheretolook.tracking.store import TrackingConfig
 from wheretolook.utils.texts import markdown_table
 from wheretolook_paper.evaluation.comparison import interval_text, log_comparison
 from wheretolook_paper.paths.config import PathsConfig

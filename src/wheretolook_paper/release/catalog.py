@@ -18,10 +18,9 @@ from matplotlib.figure import Figure
 from wheretolook.dataset.layout import Dataset
 from wheretolook.evaluation.results import CALIBRATION_CSV, SCORES_CSV, read_scores
 from wheretolook.evaluation.statistics import read_calibration
-from wheretolook.figures.style import save_figure
+from wheretolook.figures.floor_plan import save_figure
 from wheretolook.scorers.weights import load_scorer
-from wheretolook.tracking.runs import artifact, finished_runs
-from wheretolook.tracking.store import TrackingConfig, client, kept_if_not_logged
+from wheretolook.tracking import TrackingConfig, artifact, client, finished_runs, kept_if_not_logged
 from wheretolook.training.provenance import HISTORY_CSV
 from wheretolook.utils.errors import ConfigError, MissingRunError, WhereToLookError
 from wheretolook.utils.files import write_text

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from wheretolook.dataset.config import RELEASE
 from wheretolook.dataset.layout import Dataset
-from wheretolook.tracking.store import TrackingConfig
+from wheretolook.tracking import TrackingConfig
 from wheretolook.utils.errors import ConfigError
 
 RELEASE_VARIABLE = "WHERETOLOOK_RELEASE"

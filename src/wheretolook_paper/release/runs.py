@@ -19,15 +19,16 @@ from wheretolook.dataset.config import ALL
 from wheretolook.dataset.layout import Dataset
 from wheretolook.dataset.viewpoint_table import UNLABELLED, is_good
 from wheretolook.evaluation.results import SCORES_CSV, best_of, evaluation_params, read_scores, runs_of_rows
-from wheretolook.figures.style import save_figure
+from wheretolook.figures.floor_plan import save_figure
 from wheretolook.scorers.registry import learned
-from wheretolook.tracking.runs import (
+from wheretolook.tracking import (
     ALL_METHODS,
     AUC,
     BEST_TAG,
     REGRET,
     NestedRun,
     Tags,
+    TrackingConfig,
     artifact,
     experiment_ids,
     finished_runs,
@@ -36,8 +37,7 @@ from wheretolook.tracking.runs import (
     log_history,
     start_run,
 )
-from wheretolook.tracking.store import TrackingConfig
-from wheretolook.tracking.store import client as client_of
+from wheretolook.tracking import client as client_of
 from wheretolook.training.provenance import HISTORY_CSV, kept_metrics, params_of
 from wheretolook.utils.files import copy_file, temporary_folder, write_text
 from wheretolook.utils.processes import hold

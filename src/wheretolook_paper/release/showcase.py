@@ -22,10 +22,10 @@ from wheretolook.dataset.scene import Scene, SceneConfig
 from wheretolook.dataset.viewpoint_table import UNLABELLED, is_good, poses
 from wheretolook.geometry.lattices import VoxelGrid
 from wheretolook.geometry.poses import Float, poses_looking_along, rotation_looking_along
+from wheretolook.geometry.views import Views
 from wheretolook.inputs.channels import CHANNELS
 from wheretolook.planning.config import PlanConfig
-from wheretolook.planning.method_paths import path_views, plan_by_methods
-from wheretolook.planning.routes import PathView
+from wheretolook.planning.scene_map import path_views, plan_by_methods
 from wheretolook.scenes.config import ApartmentConfig, SceneKind
 from wheretolook.scorers.base import Scorer
 from wheretolook.scorers.mlp.network import BinnedNetworkScorer
@@ -310,7 +310,7 @@ def planned_views(
     dataset: Dataset,
     methods: Sequence[str] = PathsConfig.methods,
     config: PlanConfig = PlanConfig(grid=(8, 8, 4), directions=200),
-) -> dict[str, list[PathView]]:
+) -> dict[str, Views]:
     """Return the views along several methods' paths between the farthest of ten random pairs."""
     pairs = draw_pairs(showcase.space, PathsConfig(pairs=10))
     start, goal = pairs[np.linalg.norm(pairs[:, 1] - pairs[:, 0], axis=1).argmax()]

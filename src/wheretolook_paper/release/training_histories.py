@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Any
 import pandas as pd
 
 from wheretolook.dataset.layout import Dataset
-from wheretolook.tracking.runs import artifact, finished_runs
-from wheretolook.tracking.store import TrackingConfig
+from wheretolook.tracking import TrackingConfig, artifact, finished_runs
 from wheretolook.training.provenance import HISTORY_CSV, history_not_logged, params_of
 from wheretolook.utils.errors import WeightsError
 from wheretolook.utils.files import read_json_object, write_text

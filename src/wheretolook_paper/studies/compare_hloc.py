@@ -50,7 +50,7 @@ from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.evaluation.scoring import score_scenes
 from wheretolook.evaluation.statistics import precision_area, precision_over_coverage
 from wheretolook.features.extractor import KINDS, ExtractorConfig, KeypointExtractor, Keypoints, kind_of
-from wheretolook.figures.style import save_figure
+from wheretolook.figures.floor_plan import save_figure
 from wheretolook.geometry.camera import Camera, camera_of, write_cameras
 from wheretolook.geometry.pose_files import images_text
 from wheretolook.geometry.poses import Float, camera_centers, pose_error

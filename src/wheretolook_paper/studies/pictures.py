@@ -28,8 +28,8 @@ from matplotlib.style import context
 from PIL import Image
 
 from wheretolook.dataset.layout import Dataset
-from wheretolook.figures.style import RC
-from wheretolook.tracking.store import TrackingConfig, client
+from wheretolook.figures.floor_plan import RC
+from wheretolook.tracking import TrackingConfig, client
 from wheretolook_paper.commands.log_release import log_release
 from wheretolook_paper.commands.ui import ADDRESS, NAME, serving
 from wheretolook_paper.experiment_notes import experiment_link

@@ -32,7 +32,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial.distance import pdist, squareform
 
 from wheretolook.dataset.scene import ColmapFiles, Scene
-from wheretolook.figures.style import save_figure
+from wheretolook.figures.floor_plan import save_figure
 from wheretolook.geometry.camera import field_of_view_deg
 from wheretolook.geometry.poses import Float, camera_centers, poses_looking_along
 from wheretolook.holdout.holdout import choose_blocks, hold_out_blocks
@@ -41,9 +41,8 @@ from wheretolook.mapping.config import FrameOptions
 from wheretolook.mapping.georeference import DEPTH_M
 from wheretolook.mapping.photographs import read_photograph
 from wheretolook.planning.config import FORWARD, PathConfig, PlanConfig
-from wheretolook.planning.method_paths import path_views, plan_by_methods
 from wheretolook.planning.rrt import Space
-from wheretolook.planning.scene_map import scene_scorer
+from wheretolook.planning.scene_map import path_views, plan_by_methods, scene_scorer
 from wheretolook.scorers.weights import resolve_weights
 from wheretolook.utils.errors import PlanningError
 from wheretolook_paper.evaluation.comparison import replace_rows
@@ -113,7 +112,7 @@ def plan_on(
         table = pd.DataFrame({"method": method, "waypoint": np.arange(len(row))})
         table[POSITION] = path.positions / unit_m
         table[AXIS] = path.axes
-        table["visible"] = [len(view.pixels) for view in path_views(path, localization_map)]
+        table["visible"] = [len(pixels) for pixels in path_views(path, localization_map).pixels]
         table["probability"] = scorer.score(poses_looking_along(path.positions, path.axes))
         table["image"] = np.array(source.names)[row]
         table["distance"] = distance / unit_m

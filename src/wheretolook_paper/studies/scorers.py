@@ -33,8 +33,7 @@ from wheretolook.scorers.mlp import MlpConfig
 from wheretolook.scorers.set import SetConfig
 from wheretolook.scorers.set.learn import SetDataModule, learn_set
 from wheretolook.scorers.train_config import TrainConfig
-from wheretolook.tracking.runs import start_run
-from wheretolook.tracking.store import TrackingConfig
+from wheretolook.tracking import TrackingConfig, start_run
 from wheretolook.training.fit import RunLog
 from wheretolook.training.learner import TrainingJob
 from wheretolook.training.provenance import weights_path

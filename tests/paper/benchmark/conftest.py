@@ -1,18 +1,18 @@
 """A scene folder in the benchmark's layout, of a generated room: drawn and mapped as the benchmark's scripts do it."""
 
 import shutil
-from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
 
-from mapping.conftest import ROOM_SIZE, BoxFreeSpace, box_room
+from box_scenes import HIGH_X, ROOM_SIZE, box_room
 from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.mapping.rendered_map import plan_walk
 from wheretolook.mapping.triangulation import posed_model
 from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.scenes.loading import load_mesh, save_glb
+from wheretolook.space.free_space import FreeSpace
 from wheretolook_paper.benchmark.files import CAMERA, DRAWN_CAMERA, BenchmarkScene
 from wheretolook_paper.benchmark.round import build_query_map
 
@@ -24,12 +24,11 @@ def make_scene(folder):
     scene = folder / "00010-room"
     images = scene / "scene_reconstruction" / "images"
     images.mkdir(parents=True)
-    mesh = box_room()
-    textures = [np.full_like(texture, 200) if face == 1 else texture for face, texture in enumerate(mesh.textures)]
-    mesh = replace(mesh, textures=tuple(textures), corner_uvs=mesh.corner_uvs * np.float32(0.5))
+    mesh = box_room(texture_m=5.0)
+    mesh.textures[HIGH_X][:] = 200
     save_glb(mesh, scene / "room.glb")
     mesh = load_mesh(scene / "room.glb")
-    walk = plan_walk(BoxFreeSpace(), mesh.bounds, 30)
+    walk = plan_walk(FreeSpace(mesh), mesh.bounds, 30)
     poses = poses_looking_along(walk.positions, walk.directions)
     renderer = WarpRenderer(mesh)
     posed = posed_model(CAMERA, poses)

@@ -14,8 +14,7 @@ from wheretolook.dataset.viewpoint_table import poses
 from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.localization.confidence import confidence_features
 from wheretolook.mapping.landmarks import Landmarks
-from wheretolook.tracking.runs import newest_run
-from wheretolook.tracking.store import TrackingConfig
+from wheretolook.tracking import TrackingConfig, newest_run
 from wheretolook.utils.errors import ConfigError, PoseError, TableError
 from wheretolook_paper.commands.reports import LookConfig, evaluate_look_sets
 from wheretolook_paper.evaluation.looks import SET_COLUMNS, label_sets, look_table, stopping_table

@@ -10,8 +10,8 @@ from labelled_tables import HALL, SHED, SPLITS
 from synthetic_scores import EVERY_METHOD, FISHER, KEYS, make_scores
 from wheretolook.dataset.viewpoint_table import POSITIVE, pooled_labels
 from wheretolook.evaluation.statistics import calibration_rows
-from wheretolook.geometry.camera_turns import pan_tilt_angles
 from wheretolook.geometry.lattices import fibonacci_sphere
+from wheretolook.geometry.poses import pan_tilt_angles
 from wheretolook_paper.evaluation.label_report import label_summary
 from wheretolook_paper.figures.dollhouse import dollhouse
 from wheretolook_paper.figures.labels import SHADES, label_figure

@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from wheretolook.planning.routes import PathView
+from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.geometry.poses import poses_looking_along
+from wheretolook.geometry.views import Views
 from wheretolook.utils.errors import ConfigError
 from wheretolook_paper.figures.animation import save_moving
 from wheretolook_paper.figures.paths import FRAME_MS, film_frames, still_figure
@@ -17,13 +19,21 @@ LANDMARKS = RNG.uniform((0, 0, 0), (4, 3, 2), (300, 3))
 AXIS = np.array([1.0, 0, 0])
 
 
-def some_views(n, scale=1.0):
-    views = []
-    for number in range(n):
-        image = np.full((60, 80, 3), 20 * number, np.uint8) if number else None
-        pixels = RNG.uniform(0, 60, (7 + number, 2))
-        views.append(PathView(np.array([0.5 * number, 1.0, 1.4]), AXIS, scale * number / n, pixels, (80, 60), image))
-    return views
+def some_views(n: int, scale: float = 1.0) -> Views:
+    at = np.column_stack([0.5 * np.arange(n), np.ones(n), np.full(n, 1.4)])
+    images = np.broadcast_to(20 * np.arange(n, dtype=np.uint8)[:, None, None, None], (n, 60, 80, 3))
+    pixels = tuple(RNG.uniform(0, 60, (7 + number, 2)) for number in range(n))
+    score = scale * np.arange(n) / n
+    return Views(
+        poses_looking_along(at, AXIS),
+        PinholeCamera(80, 60, 40.0),
+        waypoint=np.arange(n),
+        rank=np.ones(n, dtype=np.int64),
+        score=score,
+        set_score=score,
+        pixels=pixels,
+        images=images,
+    )
 
 
 def test_films_have_a_frame_per_view(tmp_path):
@@ -43,19 +53,19 @@ def test_still_figure_draws_scores_and_landmarks(scale):
     views = some_views(9, scale)
     figure = still_figure(views, LANDMARKS, "room")
     counts = [title.split()[1] for axes in figure.axes if "landmarks" in (title := axes.get_title())]
-    assert counts == [str(len(views[number].pixels)) for number in (0, 2, 4, 6, 8)]
+    assert counts == [str(len(views.pixels[number])) for number in (0, 2, 4, 6, 8)]
     axes = next(axes for axes in figure.axes if axes.get_ylabel() == "score")
     drawn = np.arange(9)[:, None] * (0.5, scale / 9)
     np.testing.assert_allclose(axes.lines[0].get_xydata(), drawn)
     low, high = axes.get_ylim()
-    assert low <= drawn[:, 1].min() and drawn[:, 1].max() <= high
+    assert (low <= views.score).all() and (views.score <= high).all()
 
 
-def test_stops_are_marked_with_their_joint_score():
-    views = some_views(6)
-    stop = replace(views[2], n_looks=3, together=0.9)
-    further = [replace(stop, look=look) for look in (2, 3)]
-    figure = still_figure([*views[:2], stop, *further, *views[3:]], LANDMARKS)
+def test_stops_are_marked_with_their_joint_score() -> None:
+    views = some_views(6)[np.array([0, 1, 2, 2, 2, 3, 4, 5])]
+    at_stop = views.waypoint == 2
+    rank = np.where(at_stop, np.cumsum(at_stop), 1)
+    figure = still_figure(replace(views, rank=rank, set_score=np.where(at_stop, 0.9, views.score)), LANDMARKS)
     scores = next(axes for axes in figure.axes if axes.get_ylabel() == "score")
     np.testing.assert_allclose(scores.lines[0].get_ydata(), np.arange(6) / 6)  # without further views
     (mark,) = (line for line in scores.lines if line.get_label() == "all views of a stop")

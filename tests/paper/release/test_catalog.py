@@ -13,8 +13,7 @@ from wheretolook.cli import main
 from wheretolook.dataset.config import ALL
 from wheretolook.dataset.layout import Dataset
 from wheretolook.planning.config import PathConfig, PlanConfig
-from wheretolook.tracking.runs import newest_artifact, newest_run
-from wheretolook.tracking.store import TrackingConfig
+from wheretolook.tracking import TrackingConfig, newest_artifact, newest_run
 from wheretolook_paper.commands.figures import FiguresConfig
 from wheretolook_paper.figures.scores import ROWS, top_n_figure, top_n_table
 from wheretolook_paper.release.catalog import ITEMS, write_items

@@ -12,8 +12,7 @@ from wheretolook.commands.evaluate import evaluate_methods, not_logged
 from wheretolook.commands.label import log_labels
 from wheretolook.commands.train import train_methods
 from wheretolook.evaluation.config import EvaluateConfig
-from wheretolook.tracking.runs import artifact, finished_runs
-from wheretolook.tracking.store import TrackingConfig, client
+from wheretolook.tracking import TrackingConfig, artifact, client, finished_runs
 from wheretolook.training.fit import EpochRecord
 from wheretolook.utils.errors import TrackingError, TrackingWarning
 from wheretolook.utils.files import sha256
@@ -71,12 +70,12 @@ def test_a_training_that_cannot_be_logged_is_kept_and_logged_later(dataset, trac
 
 
 def test_an_evaluation_that_cannot_be_logged_is_kept_and_logged_later(dataset, tracking, monkeypatch):
-    from wheretolook.evaluation import run
+    from wheretolook.evaluation import scoring
 
     config = EvaluateConfig(("random", "visible"), resamples=50, top_n=(1,))
-    compare = run.compare_methods
+    compare = scoring.compare_methods
     with monkeypatch.context() as patch:
-        patch.setattr(run, "compare_methods", lambda *given: (break_store(tracking), compare(*given))[1])
+        patch.setattr(scoring, "compare_methods", lambda *given: (break_store(tracking), compare(*given))[1])
         with pytest.warns(TrackingWarning):
             table = evaluate_methods(dataset, config, tracking, progress=False)
     scores = (dataset.root / "results" / "scores.csv").read_bytes()

@@ -24,7 +24,7 @@ from wheretolook.dataset.layout import Dataset
 from wheretolook.dataset.viewpoint_table import poses
 from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.scorers.weights import load_scorer
-from wheretolook.tracking.store import TrackingConfig
+from wheretolook.tracking import TrackingConfig
 from wheretolook.training.data import load_views
 from wheretolook.utils.errors import ConfigError, StorageError, WeightsError
 from wheretolook.utils.files import write_json

@@ -12,8 +12,7 @@ from wheretolook.commands.evaluate import evaluate_methods as evaluate
 from wheretolook.dataset.layout import Dataset
 from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.evaluation.results import latest_scores, read_scores
-from wheretolook.tracking.runs import experiment_ids, finished_runs, newest_run
-from wheretolook.tracking.store import TrackingConfig, client
+from wheretolook.tracking import TrackingConfig, client, experiment_ids, finished_runs, newest_run
 from wheretolook_paper.release.runs import log_release
 from wheretolook_paper.release.training_histories import histories, keep_histories, trained
 

@@ -12,7 +12,7 @@ from wheretolook.commands.train import train_methods as train
 from wheretolook.dataset.layout import Dataset
 from wheretolook.dataset.viewpoint_table import is_good, poses
 from wheretolook.scorers.weights import load_scorer
-from wheretolook.tracking.store import TrackingConfig
+from wheretolook.tracking import TrackingConfig
 from wheretolook.training.weights import method_of_weights, read_training
 from wheretolook.utils.errors import ConfigError
 from wheretolook_paper.scorers.pooled_features import POOLED

@@ -3,17 +3,20 @@
 A run is named `<what>[, <condition>]... (<stage> <dataset>)`, such as "set, mesh, best 100 (evaluate release)": MLflow
 cuts long names, so what distinguishes runs comes first. MLflow stores absolute artifact paths. If a store was moved,
 its runs are still found here, since the artifacts of a run are in a folder named by its id; MLflow's UI does not show
-the artifacts of earlier runs.
-"""
+the artifacts of earlier runs."""
 
 from __future__ import annotations
 
 import hashlib
 import json
+import logging
 import math
+import os
+import re
 import shlex
 import subprocess
 import time
+import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -21,16 +24,183 @@ from functools import cache
 from importlib.metadata import entry_points
 from itertools import chain, count
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from tempfile import TemporaryFile
+from typing import TYPE_CHECKING, Any, cast
 
-from wheretolook.tracking.store import TrackingConfig, client
-from wheretolook.utils.errors import MissingRunError, TrackingError
+from wheretolook.utils.errors import MissingRunError, StorageError, TrackingError, TrackingWarning, no_option
+from wheretolook.utils.files import copy_file, storage_errors, temporary_folder, write_json
 from wheretolook.utils.package import VERSION
+from wheretolook.utils.processes import hold
 
 if TYPE_CHECKING:
     import pandas as pd
     from mlflow import MlflowClient
-    from mlflow.entities import Metric, Run
+    from mlflow.entities import Run
+
+
+@dataclass(frozen=True)
+class TrackingConfig:
+    """Where runs are logged.
+
+    Args:
+        folder: folder of the MLflow store. Created when needed; holds `mlflow.db` and `artifacts/`.
+        experiment: name of one MLflow experiment for all runs; by default, each dataset and purpose has its own, such
+            as `release: evaluation`.
+    """
+
+    folder: str = "mlruns"
+    experiment: str = no_option("")
+
+    @property
+    def root(self) -> Path:
+        """Absolute path of the store's folder."""
+        return Path(self.folder).expanduser().resolve()
+
+    @property
+    def uri(self) -> str:
+        """Tracking URI of the store."""
+        return f"sqlite:///{self.root / 'mlflow.db'}"
+
+    @property
+    def artifacts(self) -> str:
+        """Artifact location of the experiments."""
+        return str(self.root / "artifacts")
+
+
+_FIX = "Repair or move the store, or name another folder: --tracking.folder FOLDER."
+
+
+def check_store(tracking: TrackingConfig) -> None:
+    """Raise TrackingError unless the store can be opened and has room for another megabyte; create it if missing.
+
+    To be called before hours of work whose result is then logged.
+    """
+    client(tracking)
+    with store_errors(tracking.root):
+        artifacts = Path(tracking.artifacts)
+        artifacts.mkdir(exist_ok=True)
+        if not os.access(tracking.root / "mlflow.db", os.W_OK):
+            raise TrackingError("the store is read-only", path=tracking.root / "mlflow.db", fix=_FIX)
+        for folder in (tracking.root, artifacts):
+            with storage_errors(folder), TemporaryFile(dir=folder) as file:
+                file.write(bytes(2**20))
+
+
+def client(tracking: TrackingConfig) -> MlflowClient:
+    """Return a client of the store, which is created if missing; its methods raise TrackingError."""
+    return _client(tracking.root, tracking.uri)
+
+
+@contextmanager
+def kept_if_not_logged(what: str, note: Path | None = None, content: Any = None) -> Iterator[None]:
+    """Warn instead of raising a TrackingError in this block, which logs results that are already on disk.
+
+    `note` is an optional JSON file with `content`, which exists until the results are logged.
+    """
+    if note is not None:
+        write_json(note, content)
+    try:
+        yield
+    except TrackingError as error:
+        warn_not_logged(what, error)
+    else:
+        if note is not None:
+            note.unlink(missing_ok=True)
+
+
+def warn_not_logged(what: str, error: TrackingError) -> None:
+    """Warn that results are on disk but not logged, and how to log them later."""
+    later = "Fix that and run the stage again: it logs the missing results."
+    text = f"{what}: saved, but not logged: {error.path}: {error.problem}. {later}"
+    warnings.warn(text, TrackingWarning, stacklevel=3)
+
+
+@cache
+def _client(root: Path, uri: str) -> MlflowClient:
+    database = root / "mlflow.db"
+    # characters that SQLAlchemy interprets in the path of a database
+    misread = re.search(r"\?|%[0-9a-fA-F]{2}", str(root))
+    if misread:
+        fix = "Name another folder: --tracking.folder FOLDER."
+        raise TrackingError("MLflow misreads the path of this folder", path=root, value=misread[0], fix=fix)
+    with store_errors(root):
+        if not database.exists():
+            _create(database)
+        wrapped = mlflow_package().MlflowClient(tracking_uri=uri)
+        wrapped.search_experiments(max_results=1)
+    return cast("MlflowClient", _Client(root, wrapped))
+
+
+def _create(database: Path) -> None:
+    """Create an empty store in a temporary folder and move it into place, by one process at a time."""
+    with storage_errors(database):
+        database.parent.mkdir(parents=True, exist_ok=True)
+    # another process creates it in 4 s on two cores
+    with hold(database.with_name(".making.lock"), "creating the MLflow store", wait_s=60.0):
+        if database.exists():
+            return
+        with temporary_folder() as folder:
+            new = folder / "mlflow.db"
+            mlflow_package().MlflowClient(tracking_uri=f"sqlite:///{new}").search_experiments(max_results=1)
+            copy_file(new, database)
+
+
+@contextmanager
+def store_errors(root: Path) -> Iterator[None]:
+    """Re-raise OS errors and errors of MLflow, SQLAlchemy and SQLite in this block as TrackingErrors of one line."""
+    try:
+        yield
+    except TrackingError:
+        raise
+    except StorageError as error:
+        raise TrackingError(error.problem, path=error.path, value=error.value, fix=_FIX) from error
+    except OSError as error:
+        path = error.filename if isinstance(error.filename, str) else root
+        raise TrackingError(f"the store cannot be used: {error.strerror or error}", path=path, fix=_FIX) from error
+    except Exception as error:
+        if type(error).__module__.partition(".")[0] not in ("mlflow", "sqlalchemy", "sqlite3", "alembic"):
+            raise
+        first_line = (str(error).splitlines() or [""])[0] or type(error).__name__
+        problem = f"the store cannot be used: {first_line.rstrip('.')}"
+        raise TrackingError(problem, path=root / "mlflow.db", fix=_FIX) from error
+
+
+class _Client:
+    """MlflowClient whose methods raise TrackingErrors, and which copies artifacts atomically."""
+
+    def __init__(self, root: Path, wrapped: MlflowClient) -> None:
+        self._root = root
+        self._wrapped = wrapped
+
+    def log_artifact(self, run_id: str, local_path: str, artifact_path: str = "") -> None:
+        """Copy a file to the artifacts of a run."""
+        source = Path(local_path)
+        with store_errors(self._root):
+            copy_file(source, self._root / "artifacts" / run_id / "artifacts" / artifact_path / source.name)
+
+    def __getattr__(self, name: str) -> Any:
+        method = getattr(self._wrapped, name)
+
+        def call(*arguments: Any, **options: Any) -> Any:
+            with store_errors(self._root):
+                return method(*arguments, **options)
+
+        return call
+
+
+@cache
+def mlflow_package() -> Any:
+    """Import MLflow when first needed, without telemetry, notes on migrations and retries of a broken store."""
+    os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
+    os.environ.setdefault("GIT_PYTHON_REFRESH", "quiet")
+    import mlflow
+    from mlflow.store.db import utils
+
+    utils.MAX_RETRY_COUNT = 1
+    for name in ("mlflow", "alembic"):
+        logging.getLogger(name).setLevel(logging.WARNING)
+    return mlflow
+
 
 Values = Mapping[str, Any] | None
 """Parameters or metrics by name."""
@@ -57,26 +227,21 @@ digits first."""
 ALL_METHODS = "all methods"
 """What a comparison of methods runs."""
 
-NOTES_GROUP = "wheretolook.experiment_notes"
-"""Entry points of functions (stage, experiment_id) -> tags that describe a new experiment."""
 
 _MADE_BY = "made_by"  # tag of experiments of a dataset and purpose
-_KIND_TAGS = {"mlflow.experimentKind": "custom_model_development"}  # lets MLflow open the table of runs
-_METRICS_PER_BATCH = 800  # MLflow takes 1000 metrics and parameters together
-_RUNS_PER_PAGE = 50
-_PURPOSES = {
-    "evaluate": "evaluation",
-    "train": "training",
-    "adapt": "adapting",
-    "plan": "plans",
-    "label": "labels",
-    "benchmark": "benchmarks",
-}
 
 
 def experiment_name(stage: str, dataset: str) -> str:
     """Return the name of the experiment of a stage's runs on a dataset, such as "release: evaluation"; "" for no dataset."""
-    return ": ".join(filter(None, (dataset, _PURPOSES.get(stage, stage))))
+    purposes = {
+        "evaluate": "evaluation",
+        "train": "training",
+        "adapt": "adapting",
+        "plan": "plans",
+        "label": "labels",
+        "benchmark": "benchmarks",
+    }
+    return ": ".join(filter(None, (dataset, purposes.get(stage, stage))))
 
 
 def run_name(what: str, stage: str, dataset: str) -> str:
@@ -114,10 +279,13 @@ def experiment_id(mlflow_client: MlflowClient, tracking: TrackingConfig, stage: 
             break
         if known.lifecycle_stage == "active" and known.artifact_location == tracking.artifacts:
             return str(known.experiment_id)
-    tags = _KIND_TAGS | ({} if tracking.experiment else {_MADE_BY: "wheretolook"})
+    tags = {"mlflow.experimentKind": "custom_model_development"}  # lets MLflow open the table of runs
+    if not tracking.experiment:
+        tags[_MADE_BY] = "wheretolook"
     created = str(mlflow_client.create_experiment(candidate, artifact_location=tracking.artifacts, tags=tags))
     if not tracking.experiment:
-        for entry_point in entry_points(group=NOTES_GROUP):
+        # functions (stage, experiment_id) -> tags that describe a new experiment
+        for entry_point in entry_points(group="wheretolook.experiment_notes"):
             for tag, text in entry_point.load()(stage, created).items():
                 mlflow_client.set_experiment_tag(created, tag, text)
     return created
@@ -155,11 +323,10 @@ def _open_run(mlflow_client: MlflowClient, experiment: str, name: str, tags: Map
 
 def log(mlflow_client: MlflowClient, run_id: str, params: Values = None, metrics: Values = None) -> None:
     """Log parameters and metrics of a run. Metrics that are not finite are skipped."""
-    from mlflow.entities import Param
-
     log_metrics(mlflow_client, run_id, [(0, metrics or {})])
     if params:
-        texts = [Param(key, str(value)) for key, value in params.items()]
+        param = mlflow_package().entities.Param
+        texts = [param(key, str(value)) for key, value in params.items()]
         mlflow_client.log_batch(run_id, params=texts)
 
 
@@ -171,17 +338,14 @@ def log_history(mlflow_client: MlflowClient, run_id: str, history: pd.DataFrame)
 
 def log_metrics(mlflow_client: MlflowClient, run_id: str, steps: Iterable[tuple[int, Mapping[Any, Any]]]) -> None:
     """Log metrics of steps in batches. Metrics that are not finite are skipped."""
-    from mlflow.entities import Metric
-
+    metric = mlflow_package().entities.Metric
     now = int(time.time() * 1000)
-    metrics: list[Metric] = [
-        Metric(str(name), float(value), now, step)
-        for step, values in steps
-        for name, value in values.items()
-        if math.isfinite(value)
-    ]
-    for begin in range(0, len(metrics), _METRICS_PER_BATCH):
-        mlflow_client.log_batch(run_id, metrics=metrics[begin : begin + _METRICS_PER_BATCH])
+    metrics = []
+    for step, values in steps:
+        metrics += [metric(str(name), float(v), now, step) for name, v in values.items() if math.isfinite(v)]
+    at_once = 800  # MLflow takes 1000 metrics and parameters together
+    for begin in range(0, len(metrics), at_once):
+        mlflow_client.log_batch(run_id, metrics=metrics[begin : begin + at_once])
 
 
 @dataclass(frozen=True)
@@ -233,7 +397,7 @@ def finished_runs(
     order = ["attributes.start_time DESC"]
     token: str | None = None
     while searched and token != "":
-        page = mlflow_client.search_runs(searched, query, max_results=_RUNS_PER_PAGE, order_by=order, page_token=token)
+        page = mlflow_client.search_runs(searched, query, max_results=50, order_by=order, page_token=token)
         for run in page:
             matches = all(run.data.tags.get(key) == str(value) for key, value in (tags or {}).items())
             matches &= all(run.data.params.get(key) == str(value) for key, value in (params or {}).items())
@@ -285,7 +449,7 @@ def ui_command(tracking: TrackingConfig) -> str:
 def code_version() -> dict[str, str]:
     """Return the version of this package and, in a checkout, the git commit ("+" appended when files differ from it)."""
     version = {"code_version": VERSION}
-    here = Path(__file__).resolve().parents[1]
+    here = Path(__file__).resolve().parent
 
     def git(*arguments: str) -> str:
         command = ["git", "-C", str(here), *arguments]

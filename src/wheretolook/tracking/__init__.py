@@ -1,1 +1,0 @@
-"""Logging of runs to an MLflow store."""

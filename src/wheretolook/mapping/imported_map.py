@@ -76,7 +76,7 @@ def map_existing(
         database = config.database
         turned = reads_upright(config.model)
         if images is not None:
-            turned = _are_turned(model, images)
+            turned = are_turned(model, images)
             database = folder / DATABASE_FILE
             with run.clock("extract"):
                 names = list(registered_names(model).values())
@@ -161,7 +161,7 @@ def _pairs(source: Any) -> NDArray[np.int64]:
     return choose_pairs(nearness, 2 * PARTNERS, 0.0)
 
 
-def _are_turned(model: Any, folder: Path) -> bool:
+def are_turned(model: Any, folder: Path) -> bool:
     """Whether the model's images are its photographs turned upright by EXIF; else they are as stored.
 
     Decided by the sizes of the cameras, and where these fit both readings by the model's keypoints (`_keypoints_found`).

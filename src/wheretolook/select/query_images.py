@@ -16,6 +16,7 @@ from wheretolook.geometry.camera import (
     PinholeCamera,
     camera_of,
     describe_camera,
+    parse_camera,
     read_named_cameras,
     turn_camera,
 )
@@ -75,12 +76,14 @@ class QueryImages:
         self.upright = reads_upright(opened.path)
 
     def known_camera(self, camera: Camera | int | str | Path | None) -> KnownCamera | None:
-        """Return a camera, given as one, by its camera_id, or as a file of those of all images.
+        """Return a camera, given as one, by its camera_id, as a text, or as a file of the cameras of images.
 
-        Raises MapError if the model has no such camera, TableError if the file describes none.
+        Raises MapError if the model has no such camera, ConfigError or TableError if the text or the file has none.
         """
-        if isinstance(camera, (str, Path)):
+        if isinstance(camera, Path) or (isinstance(camera, str) and Path(camera).is_file()):
             return read_named_cameras(Path(camera))
+        if isinstance(camera, str):
+            return parse_camera(camera)
         if camera is not None and not isinstance(camera, (int, Camera)):
             fix = "Give a Camera, a camera_id of the model, or a file of cameras."
             raise ConfigError("this is no camera", value=camera, fix=fix)

@@ -20,11 +20,12 @@ from wheretolook.geometry.tsdf import DepthImage, DepthImages, TsdfConfig, TsdfV
 from wheretolook.mapping.colmap_model import colmap_poses, read_model
 from wheretolook.mapping.config import FrameOptions, place_name
 from wheretolook.mapping.landmarks import Landmarks
-from wheretolook.mapping.map import Map
+from wheretolook.mapping.map import Map, find_mesh
 from wheretolook.mapping.map_frame import MapFrame, warn_of_mesh
 from wheretolook.space.config import FreeSpaceConfig, MappedSpaceConfig
 from wheretolook.utils.devices import usable_device
 from wheretolook.utils.errors import ConfigError, check_positive
+from wheretolook.utils.texts import LOG
 from wheretolook.visibility.config import OCCLUSION_MODELS, OcclusionConfig, check_occlusion_names
 
 if TYPE_CHECKING:  # pandas, torch and Warp are imported when first needed
@@ -128,6 +129,8 @@ class Scene:
         """
         scene = cls(files, camera, config, device)
         name = occlusion or scene.available_occlusion[0]
+        if occlusion is None and files.mesh is None and files.depth is None and (mesh := find_mesh(files.model)):
+            LOG.info("mesh not used: %s; --mesh gives occlusion by it, if it is in the map's frame", mesh)
         scene.check_occlusion(name)
         scene.config = replace(config, occlusion=replace(config.occlusion, model=name))
         return scene

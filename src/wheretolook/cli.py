@@ -231,7 +231,7 @@ def build_parser(name: str) -> Any:
     )
     parser.add_argument("--config", help="YAML file with a section for each group of options")
     parser.add_argument("--print_config", type=bool, default=False, help="only print all options as YAML")
-    groups = {"": parser}
+    groups: dict[str, Any] = {"": parser}
     for option, known in command_options(command).items():
         if known.group not in groups:
             groups[known.group] = parser.add_argument_group(known.group.rstrip("."))

@@ -7,12 +7,13 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import pycolmap
 import pytest
 
 import wheretolook
 from mapping.test_own_models import rig_model, written
 from wheretolook.mapping.colmap_model import colmap_poses, read_model, registered_names
-from wheretolook.utils.errors import MapError
+from wheretolook.utils.errors import MapError, MapWarning
 
 NAN = float("nan")
 # File, offset in the binary model of `rig_model`, layout and value of the change.
@@ -72,6 +73,35 @@ def test_text_models_with_marks_and_ends_of_lines_of_windows(tmp_path):
     np.testing.assert_array_equal(colmap_poses(folder, read), colmap_poses(folder, model))
     assert registered_names(read) == registered_names(model)
     assert read.num_points3D() == model.num_points3D()
+
+
+@pytest.mark.parametrize("text", [False, True])
+def test_poses_of_images_replace_frames_that_contradict_the_points(tmp_path, text):
+    """Programs from before COLMAP 3.12 write cameras, images and points, and leave older rigs and frames in the folder."""
+    older = rig_model()
+    older.transform(pycolmap.Sim3d(3.0, pycolmap.Rotation3d(np.array([0.0, 0, 0.6, 0.8])), np.array([5.0, 1, 2])))
+    folder = written(rig_model(), tmp_path / "model", text)
+    expected = colmap_poses(folder)
+    (frames,) = folder.glob("frames.*")
+    frames.write_bytes((written(older, tmp_path / "older", text) / frames.name).read_bytes())
+    with pytest.warns(MapWarning, match="4 of 4 images"):
+        model = read_model(folder)
+    np.testing.assert_allclose(colmap_poses(folder, model), expected, atol=1e-9)
+    points = next(folder.glob("points3D.*"))
+    points.write_bytes((tmp_path / "older" / points.name).read_bytes())
+    assert colmap_poses(folder, read_model(folder)).shape == (4, 3, 4)  # points and frames are of one reconstruction
+    for path in (frames, frames.with_name(f"rigs{frames.suffix}")):
+        path.unlink()
+    with pytest.raises(MapError, match="contradict one another"):
+        read_model(folder)
+
+
+def test_observations_in_pixels_of_larger_images_are_reported(tmp_path):
+    model = rig_model()
+    for camera in model.cameras.values():
+        camera.rescale(0.25)
+    with pytest.warns(MapWarning, match="4 times as large"):
+        assert read_model(written(model, tmp_path / "model")).num_points3D() == 12
 
 
 FLIPS = """

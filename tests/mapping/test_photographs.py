@@ -57,6 +57,32 @@ def test_depth_images_are_no_photographs(tmp_path, caplog):
     assert "2 depth images" in caplog.text
 
 
+def test_grey_of_more_bits_than_8_is_read(tmp_path):
+    grey = np.arange(600, dtype=np.uint16).reshape(20, 30) * 255 // 599
+    for name, values in {"a.png": grey, "b.png": grey * 257, "c.tiff": grey * 16, "d.tiff": grey * 4}.items():
+        Image.fromarray(values if values.max() > 255 else values.astype(np.uint8)).save(tmp_path / name)
+    assert list_photographs(tmp_path) == ["a.png", "b.png", "c.tiff", "d.tiff"]
+    for name in "b.png", "c.tiff", "d.tiff":
+        np.testing.assert_array_equal(read_photograph(tmp_path / name)[..., 0], grey)
+
+
+def test_pixels_of_32_bits_are_rejected(tmp_path):
+    Image.fromarray(np.zeros((20, 30), np.float32)).save(tmp_path / "a.tiff")
+    with pytest.raises(MapError, match="8-bit"):
+        read_photograph(tmp_path / "a.tiff")
+
+
+def test_other_formats_are_counted_and_links_followed_once(tmp_path, caplog):
+    for name in ("photos/a.jpg", "elsewhere/b.jpg", "elsewhere/c.jpg"):
+        save(tmp_path / name, sized(20, 30))
+    for name in ("d.HEIC", "e.heic", "f.dng"):
+        (tmp_path / "photos" / name).touch()
+    for link, target in (("cam0", "elsewhere"), ("cam1", "elsewhere"), ("loop", "photos")):
+        (tmp_path / "photos" / link).symlink_to(tmp_path / target)
+    assert list_photographs(tmp_path / "photos") == ["a.jpg", "cam0/b.jpg", "cam0/c.jpg"]
+    assert "1 .dng, 2 .heic" in caplog.text
+
+
 def test_names_that_colmap_cannot_read_are_rejected(tmp_path):
     for name in (b"a.png", b"caf\xe9.png", "ä.png".encode()):
         (tmp_path / os.fsdecode(name)).touch()

@@ -15,7 +15,7 @@ from wheretolook.dataset.config import checked_accuracy
 from wheretolook.features.extractor import ExtractorConfig
 from wheretolook.figures import KINDS
 from wheretolook.mapping.config import FrameOptions
-from wheretolook.mapping.photographs import SUFFIXES
+from wheretolook.mapping.photographs import SUFFIXES, find_photograph_files
 from wheretolook.utils.devices import usable_device
 from wheretolook.utils.errors import ConfigError, MapError, WhereToLookError, check_choice
 
@@ -153,8 +153,7 @@ class Localize(CameraOptions, FrameOptions):
         """Return the files of all images. Raises MapError if one is missing, or a folder has none."""
         paths: list[Path] = []
         for path in self.images:
-            in_folder = (file for file in path.rglob("*") if file.suffix.lower() in SUFFIXES)
-            found = [path] if path.is_file() else sorted(file for file in in_folder if file.is_file())
+            found = [path] if path.is_file() else find_photograph_files(path)
             if not found:
                 fix = f"Give images, or folders of images that end in {', '.join(SUFFIXES)}."
                 raise MapError("there is no image here", path=path, fix=fix)

@@ -93,11 +93,17 @@ def without_marks(folder: Path, suffix: str) -> Iterator[Path]:
 
 def check_text_complete(path: Path, n_read: int) -> None:
     """Raise MapError if fewer entries were read than the number that COLMAP writes at the top of a text file."""
+    announced = _announced(path)
+    if n_read < announced:
+        raise MapError(f"the file is truncated: it announces {announced}", path=path, value=n_read, fix=REBUILD)
+
+
+def _announced(path: Path) -> int:
+    """Number of entries that COLMAP writes at the top of a text file; 0 if there is none."""
     with path.open(errors="replace") as file:
         head = "".join(line for line in itertools.islice(file, 6) if line.startswith("#"))
     announced = re.search(r"# Number of \w+: (\d+)", head)
-    if announced and n_read < int(announced[1]):
-        raise MapError(f"the file is truncated: it announces {announced[1]}", path=path, value=n_read, fix=REBUILD)
+    return int(announced[1]) if announced else 0
 
 
 def check_cameras_and_images(model: Any, folder: Path, suffix: str) -> None:
@@ -232,42 +238,122 @@ def read_model(model_dir: str | Path) -> Any:
     """
     folder = Path(model_dir)
     suffix = model_suffix(folder)
-    import pycolmap
-
     n_bytes = sum((folder / (name + suffix)).stat().st_size for name in MODEL_FILES)
     bar = tqdm(total=2, desc=f"model of {n_bytes / 1e9:.1f} GB: read", unit="step", disable=n_bytes < 500e6)
-    model = pycolmap.Reconstruction()
     with bar, quiet_colmap():
         if suffix == ".bin":
             check_binary(folder)
         bar.update()
-        try:
-            with without_marks(folder, suffix) as readable:
-                (model.read_binary if suffix == ".bin" else model.read_text)(str(readable))
-            check_cameras_and_images(model, folder, suffix)
-        except (ValueError, LookupError, RuntimeError, MemoryError) as error:
-            raise model_error(error, folder, suffix) from error
+        model = _consistent(_read_files(folder, suffix), folder, suffix)
         bar.update()
+    _warn_of_larger(folder, model.num_images())
+    return model
+
+
+def _read_files(folder: Path, suffix: str) -> Any:
+    """Read a model with pycolmap. Raises MapError, which names the file, if that fails or a camera or pose is impossible."""
+    import pycolmap
+
+    model = pycolmap.Reconstruction()
+    try:
+        with without_marks(folder, suffix) as readable:
+            (model.read_binary if suffix == ".bin" else model.read_text)(str(readable))
+        check_cameras_and_images(model, folder, suffix)
+    except (ValueError, LookupError, RuntimeError, MemoryError) as error:
+        raise model_error(error, folder, suffix) from error
     if suffix == ".txt":
         numbers = (model.num_cameras(), model.num_images(), model.num_points3D())
         for name, number in zip(MODEL_FILES, numbers, strict=True):
             check_text_complete(folder / f"{name}.txt", number)
         check_coordinates(_points_and_tracks(model)[0], folder / "points3D.txt")
-    _warn_of_larger(folder, model.num_images())
     return model
+
+
+def _consistent(model: Any, folder: Path, suffix: str) -> Any:
+    """Return the model in a folder if its points reproject to their observations, or the one without rigs and frames.
+
+    Rigs and frames are older than the other files if a program wrote only these, as before COLMAP 3.12. A `MapWarning`
+    reports that, and observations in pixels of images of another size than the cameras'. Raises MapError for points,
+    poses and cameras that contradict one another.
+    """
+    error = _contradiction(model)
+    if not error:
+        return model
+    with temporary_folder() as copy, suppress(MapError):
+        if (folder / f"frames{suffix}").is_file():
+            for name in MODEL_FILES:
+                (copy / (name + suffix)).symlink_to((folder / (name + suffix)).resolve())
+            without_frames = _read_files(copy, suffix)
+            if not _contradiction(without_frames):
+                text = (
+                    f"{folder}: rigs and frames contradict the points ({error}); the poses in images{suffix} are used"
+                )
+                warnings.warn(text, MapWarning, stacklevel=4)
+                return without_frames
+    pixels = np.concatenate(_reprojections(model))
+    size = float(np.nanmedian(pixels[:, 1] / np.where(pixels[:, 0] > 1, pixels[:, 0], np.nan)))
+    if size > 0 and not _contradiction(model, size):
+        text = f"{folder}: observations are in images {size:.3g} times as large as those of the cameras, which are used"
+        warnings.warn(text, MapWarning, stacklevel=4)
+        return model
+    problem = f"cameras, poses and points contradict one another: {error}"
+    fix = "Copy all files of one reconstruction; a transformation applies to points, images and frames."
+    raise MapError(problem, path=folder, fix=fix)
+
+
+def _contradiction(model: Any, size: float = 1.0) -> str:
+    """Describe how many images of a model see points off their observations, in pixels of images `size` times as large.
+
+    Returns "" if that is at most a tenth of them, given the stated errors of the points.
+    """
+    side_px = max((max(camera.width, camera.height) for camera in model.cameras.values()), default=1) * size
+    # COLMAP drops observations with larger errors than 4 px; programs that state no errors may keep them
+    stated_px = model.compute_mean_reprojection_error() or side_px / 400
+    limit_px = min(max(4.0, 4 * stated_px), side_px / 20)
+    near = [np.linalg.norm(size * pixels[:, 0] - pixels[:, 1], axis=1) <= limit_px for pixels in _reprojections(model)]
+    wrong = sum(of_image.mean() < 0.5 for of_image in near)
+    return f"{wrong} of {len(near)} images see most points over {limit_px:.0f} px off" if 10 * wrong > len(near) else ""
+
+
+def _reprojections(model: Any) -> list[Float]:
+    """Pixels (K, 2, 2), projected and observed, of about 20 observations in each of about 50 images; NaN behind the camera.
+
+    Images with all observations at one pixel are left out: some converters do not know them.
+    """
+    images = [image for image in model.images.values() if image.has_pose and image.num_points3D]
+    sample = []
+    for image in images[:: 1 + len(images) // 50]:
+        rows = image.get_observation_point2D_idxs()
+        observed = [image.points2D[row] for row in rows[:: 1 + len(rows) // 20]]
+        projected = [image.project_point(model.points3D[point.point3D_id].xyz) for point in observed]
+        behind = (np.nan, np.nan)
+        pairs = [(behind if at is None else at, point.xy) for at, point in zip(projected, observed, strict=True)]
+        sample.append(np.array(pairs, dtype=np.float64))
+    return [pixels for pixels in sample if np.ptp(pixels[:, 1], axis=0).any()]
 
 
 def _warn_of_larger(folder: Path, n_images: int) -> None:
     """Warn of a model of more images among those of one reconstruction: sparse/N of COLMAP, models/N of hloc."""
-    others = [*folder.glob("models/*/images.bin")]
+    others = [*folder.glob("models/*/images.*")]
     if folder.name.isdigit():
-        others += folder.parent.glob("[0-9]*/images.bin")
+        others += folder.parent.glob("[0-9]*/images.*")
     for path in others:
-        with suppress(OSError), path.open("rb") as file:
-            n_others = int.from_bytes(file.read(8), "little")  # as COLMAP begins the file
+        with suppress(OSError):
+            n_others = _count_images(path)
             if n_others > n_images:
                 text = f"{folder} has {n_images} images, the model in {path.parent} has {n_others:,}: is that the map?"
                 warnings.warn(text, MapWarning, stacklevel=3)
+
+
+def _count_images(path: Path) -> int:
+    """Number of images in an images.bin or images.txt; 0 for another file."""
+    if path.suffix == ".bin":
+        with path.open("rb") as file:
+            return int.from_bytes(file.read(8), "little")
+    if path.suffix != ".txt":
+        return 0
+    with path.open(errors="replace") as file:  # an image's line ends in its name, one of keypoints in a number
+        return _announced(path) or sum(bool(re.match(r"[^#\s].*[^\d\s]\s*$", line)) for line in file)
 
 
 def write_model(reconstruction: Any, folder: Path) -> None:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+from collections import Counter
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -20,18 +22,13 @@ SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
 
 
 def list_photographs(folder: Path) -> list[str]:
-    """List photographs in a folder and its subfolders by relative name, without depth images (PNG, 16-bit grey).
+    """List photographs in a folder and its subfolders by relative name, as `find_photograph_files` does.
 
     Raises MapError if there are fewer than two, or a name is not in UTF-8, which COLMAP needs.
     """
     if not folder.is_dir():
         raise MapError("there is no such folder", path=folder, fix="Give the folder of the photographs.")
-    files = [path for path in folder.rglob("*") if path.is_file() and path.suffix.lower() in SUFFIXES]
-    n_files = len(files)
-    files = [path for path in files if not _is_depth_image(path)]
-    if len(files) < n_files:
-        LOG.warning("%s: %d depth images (PNG, 16-bit grey) are left out", folder, n_files - len(files))
-    names = sorted(path.relative_to(folder).as_posix() for path in files)
+    names = [path.relative_to(folder).as_posix() for path in find_photograph_files(folder)]
     for name in names:
         if name != name.encode(errors="replace").decode():
             raise MapError("the name of a photograph is not in UTF-8", path=folder, value=name, fix="Rename it.")
@@ -41,7 +38,49 @@ def list_photographs(folder: Path) -> list[str]:
     return names
 
 
-def _is_depth_image(path: Path) -> bool:
+def find_photograph_files(folder: Path) -> list[Path]:
+    """List the files of photographs in a folder and its subfolders, also those behind links, sorted by name.
+
+    Logs what is left out: depth images, and numbers of files in other formats.
+    """
+    files: list[Path] = []
+    visited = set[str]()
+    for parent, folders, names in os.walk(folder, followlinks=True):
+        folders.sort()
+        real = os.path.realpath(parent)
+        if real in visited:  # by another link, which may be a cycle
+            folders.clear()
+            continue
+        visited.add(real)
+        files += [path for name in names if (path := Path(parent, name)).is_file()]
+    photographs = [path for path in files if path.suffix.lower() in SUFFIXES]
+    others = Counter(path.suffix.lower() for path in files if path.suffix.lower() not in ("", *SUFFIXES))
+    if others:
+        listed = ", ".join(f"{number} {suffix}" for suffix, number in sorted(others.items()))
+        _warn_once("%s: files in other formats are left out: %s", folder, listed)
+    depth = _depth_images(photographs)
+    if depth:
+        text = "%s: %d depth images (16-bit grey, named depth or numbered as a photograph) are left out"
+        _warn_once(text, folder, len(depth))
+    return sorted(set(photographs) - depth, key=lambda path: path.relative_to(folder).as_posix())
+
+
+_warn_once = cache(LOG.warning)  # a folder is listed several times
+
+
+def _depth_images(photographs: list[Path]) -> set[Path]:
+    """Return the PNGs of 16-bit grey that are named depth, or have the number of another photograph."""
+    grey = {path for path in photographs if _is_16_bit_grey(path)}
+    numbers = {_number(path) for path in photographs if path not in grey}
+    return {path for path in grey if "depth" in f"{path.parent.name}/{path.name}".lower() or _number(path) in numbers}
+
+
+def _number(path: Path) -> str:
+    """Return the digits in a file's name, or without any its first part."""
+    return "".join(filter(str.isdecimal, path.stem)) or path.name.partition(".")[0]
+
+
+def _is_16_bit_grey(path: Path) -> bool:
     """Return whether a file is a PNG of one channel with 16 bits, by its header."""
     if path.suffix.lower() != ".png" or not os.access(path, os.R_OK):
         return False
@@ -52,14 +91,23 @@ def _is_depth_image(path: Path) -> bool:
 def read_photograph(path: Path, turned: bool = True) -> NDArray[np.uint8]:
     """Read a photograph (H, W, 3) uint8 RGB, turned upright by its EXIF orientation, or as stored.
 
+    Of 16-bit pixels, the highest 8 bits in use are read: of 10, 12, 14 or 16, the fewest that hold the brightest pixel.
     Raises MapError if the file cannot be read.
     """
     import cv2
 
+    flags = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH
     try:
-        bgr = read_image(path, cv2.IMREAD_COLOR if turned else cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+        bgr = read_image(path, flags if turned else flags | cv2.IMREAD_IGNORE_ORIENTATION)
+        if bgr.dtype == np.uint16:
+            bits = next(bits for bits in (10, 12, 14, 16) if bgr.max() < 2**bits)
+            if bits < 16:
+                _warn_once("%s: pixels are stored with 16 bits and read as %d", path.parent, bits)
+            bgr = (bgr >> (bits - 8)).astype(np.uint8)
+        elif bgr.dtype != np.uint8:
+            raise ValueError(f"its pixels are {bgr.dtype}, neither of 8 nor of 16 bits")
     except (OSError, ValueError) as error:
-        fix = "Remove it, or copy it again."
+        fix = "Convert it to JPEG or 8-bit PNG, remove it, or copy it again."
         raise MapError(f"cannot read this photograph: {error}", path=path, fix=fix) from error
     return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), dtype=np.uint8)
 

@@ -358,7 +358,8 @@ def read_arguments(
         if found is None:
             if hasattr(command, "root") and "." in name and option_of(name, configurable_options()):
                 continue  # of a group of another command: the same options may be given to all
-            fix = did_you_mean(name, [*known, *command.SHORT], "--")
+            meant = {"top": "n", "num": "n", "k": "n"}.get(name, name)  # of the best views
+            fix = did_you_mean(meant if meant in known else name, [*known, *command.SHORT], "--")
             raise ConfigError("unknown option", value=option, fix=fix)
         value = with_keys(name, found, read_value(option, str(options.get(found)), texts, found == "print_config"))
         if found == "config":

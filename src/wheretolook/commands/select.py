@@ -94,6 +94,7 @@ class SelectorOptions(CameraOptions, ScorerOptions, FrameOptions):
                 method=self.method,
                 camera=self.named_camera(),
                 mesh=self.mesh,
+                mesh_up=self.mesh_up,
                 depth=self.depth,
                 depth_scale=self.depth_scale,
                 occlusion=self.occlusion,

@@ -28,9 +28,9 @@ from wheretolook.scorers.registry import make_scorer
 from wheretolook.scorers.weights import load_scorer, resolve_weights
 from wheretolook.select.selection import explained, reported, select_views
 from wheretolook.select.waypoints import SelectionRequest, Waypoints, grid_waypoints, usable_waypoints
-from wheretolook.space.free_space import MappedSpace
+from wheretolook.space.mapped_space import MappedSpace
 from wheretolook.utils.devices import usable_device
-from wheretolook.utils.errors import ConfigError, PlanningError
+from wheretolook.utils.errors import ConfigError, PlanningError, check_names
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -115,6 +115,7 @@ class WhereToLook:
         device = usable_device(device)
         camera = _described_camera(camera, fov_deg)
         axes = direction_lattice(directions, lattice)
+        check_names("option of the frame", frame, FrameOptions)
         resolve_weights(method, weights)  # so that missing ones are reported before anything is read
         mesh, depth, database = (None if file is None else Path(file) for file in (mesh, depth, database))
         options = FrameOptions(**frame)
@@ -269,6 +270,7 @@ class WhereToLook:
             look = self.at_accuracy(accuracy)
             return look.best(points, n, ids=ids, heading_deg=heading_deg, progress=progress, **options)
         waypoints = Waypoints.of(points, ids, heading_deg)
+        check_names("option of best", options, SelectionRequest, ("ids", "heading_deg", "progress", "accuracy"))
         request = SelectionRequest(n=n, **options)
         return select_views(self.scorer, self.reasons, self.directions, waypoints, request, progress)
 

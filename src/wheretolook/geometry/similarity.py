@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -13,11 +13,11 @@ from wheretolook.geometry.poses import Float
 
 @dataclass(frozen=True, eq=False)
 class Similarity:
-    """x -> scale * rotation x + translation."""
+    """x -> scale * rotation x + translation; by default the identity."""
 
-    scale: float  # positive
-    rotation: Float  # (3, 3)
-    translation: Float  # (3,), in units of the target
+    scale: float = 1.0  # positive
+    rotation: Float = field(default_factory=lambda: np.eye(3))
+    translation: Float = field(default_factory=lambda: np.zeros(3))  # (3,), in units of the target
 
     def apply(self, points: ArrayLike) -> NDArray[np.float64]:
         """Transform points (..., 3)."""

@@ -14,18 +14,19 @@ from holdout.corridor import ALONE, N, corridor_poses, write_corridor
 from holdout.rendered_room import write_rendered_room
 from selection.room import WEIGHTS
 from wheretolook.cli import parse_command
-from wheretolook.geometry.poses import camera_centers
-from wheretolook.holdout.holdout import KEPT, MIN_REST, choose_blocks, landmarks_kept, without
+from wheretolook.geometry.poses import camera_centers, poses_looking_along
+from wheretolook.holdout.holdout import KEPT, MIN_REST, Block, choose_blocks, hold_out_blocks, landmarks_kept, without
 from wheretolook.holdout.photo_map import open_map
 from wheretolook.holdout.report import CheckReport
 from wheretolook.holdout.scores import whole_map
 from wheretolook.mapping.colmap_model import model_arrays, observation_matrix, read_model
 from wheretolook.mapping.config import FrameOptions
+from wheretolook.mapping.map import find_source
 from wheretolook.scorers.adapted.score import AdaptedNetwork
 from wheretolook.scorers.set.network import SetNetwork
 from wheretolook.scorers.set.score import for_map
 from wheretolook.training.trained_network import TrainedNetwork
-from wheretolook.utils.errors import ConfigError, MapError, WeightsError
+from wheretolook.utils.errors import ConfigError, MapError, MapWarning, WeightsError
 from wheretolook.visibility.hidden_points import HiddenPointRemoval
 
 
@@ -105,6 +106,34 @@ def test_blocks_share_out_all_photographs_and_grow(corridor):
     few = choose_blocks(source, views=3)
     assert max(len(block.tested) for block in few) == 3
     assert all(np.isin(block.tested, block.held_out).all() for block in few)
+
+
+def test_a_block_without_which_rays_hardly_meet_is_dropped_and_said(tmp_path, monkeypatch):
+    """A video that stands still: 20 photographs within 4 cm of a wall 2 m away, and 10 that give the landmarks depth."""
+    along = np.concatenate([0.002 * np.arange(20), 0.3 * np.arange(1, 11)])
+    centers = np.column_stack([along, np.zeros(N), np.full(N, 1.5)])
+    poses = poses_looking_along(centers, np.tile((0.0, 1.0, 0.0), (N, 1)))
+    monkeypatch.setattr("holdout.corridor.corridor_poses", lambda: poses)
+    source = open_map(*write_corridor(tmp_path), frame=FrameOptions(scale=1))
+    groups = [np.arange(20, 30), np.arange(5), np.arange(5, 10)]
+    blocks = [Block(number, rows, rows[:2], True) for number, rows in enumerate(groups, 1)]
+    with pytest.warns(MapWarning, match=r"10 photographs \(020.jpg to 029.jpg\)"):
+        results = hold_out_blocks(source, tmp_path / "work", blocks)
+    assert [one.block.number for one in results] == [2, 3]
+    with pytest.raises(MapError, match="landmarks are left"), pytest.warns(MapWarning):
+        hold_out_blocks(source, tmp_path / "work", blocks[:2])
+
+
+def test_features_of_other_keypoints_give_way_to_photographs(corridor, tmp_path):
+    sparse, database = corridor
+    shutil.copytree(sparse, tmp_path / "dense" / "sparse")
+    shutil.copy(database, tmp_path / "database.db")
+    assert find_source(tmp_path / "dense" / "sparse") == (tmp_path / "database.db", None)
+    (tmp_path / "dense" / "images").mkdir()
+    (tmp_path / "dense" / "images" / "000.jpg").touch()
+    assert find_source(tmp_path / "dense" / "sparse") == (tmp_path / "database.db", None)
+    write_corridor(tmp_path / "other", noise_px=2.0)[1].rename(tmp_path / "database.db")
+    assert find_source(tmp_path / "dense" / "sparse") == (None, tmp_path / "dense" / "images")
 
 
 # --- the command

@@ -6,14 +6,16 @@ import warnings
 from pathlib import Path
 
 import numpy as np
+import pycolmap
 import pytest
 
+from colmap_models import camera, model_of
 from mapping.test_landmarks import hand_written_model
 from wheretolook.cli import main
 from wheretolook.mapping.colmap_model import model_arrays, read_model, write_model
 from wheretolook.mapping.feature_files import read_descriptors
-from wheretolook.mapping.map import Map, choose_features, find_features, find_photographs
-from wheretolook.utils.errors import MapWarning
+from wheretolook.mapping.map import Map, choose_features, find_features, find_mesh, find_photographs
+from wheretolook.utils.errors import MapError, MapWarning
 from wheretolook.utils.files import sha256
 from wheretolook.utils.package import WEIGHTS, shipped
 
@@ -85,6 +87,28 @@ def test_images_and_features_are_found_above_the_model(outputs, model):
     image.touch()
     assert find_photographs(folder) == outputs.parent / "images"
     assert find_features(folder) == outputs / FEATURES.name
+
+
+def test_a_mesh_next_to_a_model_is_found_and_a_cloud_is_not(tmp_path):
+    model = tmp_path / "dense" / "sparse"
+    model.mkdir(parents=True)
+    (tmp_path / "dense" / "fused.ply").write_text(
+        "ply\nformat ascii 1.0\nelement vertex 1\nelement face 0\nend_header\n"
+    )
+    assert find_mesh(model) is None
+    mesh = tmp_path / "dense" / "meshed.ply"
+    mesh.write_text("ply\nformat ascii 1.0\nelement vertex 3\nelement face 1\nend_header\n")
+    assert find_mesh(model) == mesh
+
+
+def test_a_model_without_tracks_names_the_command_that_makes_them(tmp_path):
+    model = model_of(
+        [camera(1, "PINHOLE", 640, 480, 500, 500, 320, 240)], [("a.jpg", 1, np.eye(3, 4), np.zeros((1, 2)))]
+    )
+    model.add_point3D((0, 0, 3), pycolmap.Track(), (0, 0, 0))
+    write_model(model, tmp_path)
+    with pytest.raises(MapError, match=r"wheretolook map --model .* --images"):
+        Map.open(tmp_path)
 
 
 @pytest.mark.parametrize("as_text", [False, True])

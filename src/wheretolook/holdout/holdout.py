@@ -89,17 +89,33 @@ def choose_blocks(source: PhotographedMap, views: int = VIEWS) -> list[Block]:
     chosen = list[tuple[NDArray[np.int64], bool]]()
     for group, is_part in reversed(groups):  # of two that are the same, the one that is grown further is chosen
         held_out = np.flatnonzero(np.isin(source.rig_frame, group))
-        leaves_map = _landmarks_without(observes, group) >= MIN_LANDMARKS
-        if leaves_map and not any(_same(held_out, other) for other, _ in chosen):
+        if not _leaves_map(source, held_out, _landmarks_without(observes, group)):
+            continue
+        if not any(_same(held_out, other) for other, _ in chosen):
             chosen.append((held_out, is_part))
-    if len(chosen) < 2:
-        problem = f"without a block of neighbouring photographs fewer than {MIN_LANDMARKS} landmarks are left"
-        fix = "Take more photographs, each part of the scene from several sides, and map them all."
-        raise MapError(problem, path=source.path, value=f"{len(source.poses)} photographs", fix=fix)
+    _check_count(source, len(chosen))
     return [
         Block(number, held_out, held_out[_spread(len(held_out), views)], is_part)
         for number, (held_out, is_part) in enumerate(reversed(chosen), 1)
     ]
+
+
+def _leaves_map(source: PhotographedMap, held_out: NDArray[np.int64], n_landmarks: int) -> bool:
+    """Return whether the landmarks left without some photographs (rows) are enough for a map; a `MapWarning` if not."""
+    if n_landmarks >= MIN_LANDMARKS:
+        return True
+    ends = f"{source.names[held_out[0]]} to {source.names[held_out[-1]]}"
+    text = f"{source.path}: a block of {len(held_out)} photographs ({ends}) is not held out: {n_landmarks} landmarks"
+    warnings.warn(f"{text} would be left, fewer than {MIN_LANDMARKS}", MapWarning, stacklevel=3)
+    return False
+
+
+def _check_count(source: PhotographedMap, n_blocks: int) -> None:
+    """Raise MapError for fewer than two blocks."""
+    if n_blocks < 2:
+        problem = f"without a block of neighbouring photographs fewer than {MIN_LANDMARKS} landmarks are left"
+        fix = "Take more photographs, each part of the scene from several sides, and map them all."
+        raise MapError(problem, path=source.path, value=f"{len(source.poses)} photographs", fix=fix)
 
 
 def _spread(n: int, max_count: int) -> NDArray[np.int64]:
@@ -216,7 +232,8 @@ def hold_out_blocks(
     Observations of held-out photographs are removed from the tracks, and the affected landmarks are triangulated again
     (`without`). Landmarks, their attributes and descriptors then depend on the remaining photographs alone; poses and
     intrinsics are the whole map's. Finished blocks are cached in `work`. By default blocks are those of
-    `choose_blocks`.
+    `choose_blocks`. A block without which too few landmarks can be triangulated, as in videos, is left out with a
+    `MapWarning`. Raises MapError if fewer than two remain.
     """
     blocks = choose_blocks(source) if blocks is None else blocks
     limits = [source.limit_m.tolist(), MAX_ERROR_DEG, MIN_ANGLE_DEG, asdict(LocalizerConfig()), source.fov_deg]
@@ -243,11 +260,14 @@ def hold_out_blocks(
     left = sum(len(job.block.tested) for job in jobs)
     bar = tqdm(total=total, initial=total - left, desc="check: hold out, localize", unit="view")
     with bar, WorkerPool(max(1, min(workers, len(jobs)))) as pool:
-        for job, _ in zip(jobs, pool.map(_run, jobs), strict=True):
-            results[job.block.number] = _load(job.cache, job.block)
+        for job, n_landmarks in zip(jobs, pool.map(_run, jobs), strict=True):
+            if _leaves_map(source, job.block.held_out, n_landmarks):
+                results[job.block.number] = _load(job.cache, job.block)
             bar.update(len(job.block.tested))
     shutil.rmtree(model, ignore_errors=True)
-    return [result for result in results.values() if result is not None]
+    finished = [result for result in results.values() if result is not None]
+    _check_count(source, len(finished))
+    return finished
 
 
 def judged(result: HoldoutResult, accuracy: Accuracy) -> HoldoutResult:
@@ -295,12 +315,17 @@ def _model(folder: Path) -> Any:
     return read_model(folder)
 
 
-def _run(job: _BlockJob) -> None:
-    """Hold out a block, localize its photographs, and store the result."""
+def _run(job: _BlockJob) -> int:
+    """Hold out a block, localize its photographs, and store the result. Returns the number of landmarks that are left.
+
+    Nothing is localized and stored if that is below `MIN_LANDMARKS`.
+    """
     torch.set_num_threads(1)
     whole = _model(job.model)
     image_ids = job.source.arrays.image_ids
     rest = without(whole, image_ids[job.block.held_out].tolist())
+    if rest.num_points3D() < MIN_LANDMARKS:
+        return int(rest.num_points3D())
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", MapWarning)
         landmarks = load_colmap_landmarks(job.model, job.source.features, None, job.device, rest, progress=False)
@@ -318,6 +343,7 @@ def _run(job: _BlockJob) -> None:
     job.cache.clear()
     replace(landmarks, descriptors=None).save(job.cache.folder / "landmarks.npz")
     job.cache.store({"views.json": views.to_dict("list")})
+    return len(landmarks)
 
 
 def _observed(image: Any, source: PhotographedMap, row: int, crop: int) -> NDArray[np.int64]:

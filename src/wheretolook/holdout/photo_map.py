@@ -32,7 +32,7 @@ from wheretolook.mapping.feature_files import DATABASE_FILE, read_descriptors
 from wheretolook.mapping.georeference import DEPTH_M, median_depths
 from wheretolook.mapping.imported_map import map_existing
 from wheretolook.mapping.landmarks import load_colmap_landmarks
-from wheretolook.mapping.map import Map, find_features, find_photographs
+from wheretolook.mapping.map import Map, find_source
 from wheretolook.mapping.map_frame import IDENTITY, MapFrame, find_frame, has_photographs
 from wheretolook.utils.errors import ConfigError, MapError, MapWarning
 from wheretolook.utils.files import ArtifactCache, cache_key, fingerprint, safe_child, size_and_time
@@ -207,7 +207,7 @@ def open_map(
     model = read_model(model_dir)
     _check_photographs(model, model_dir)
     if model.num_points3D() == 0:
-        fix = "Triangulate it, or give the folder of its photographs: --images."
+        fix = "Give the folder of its photographs to triangulate it: --images."
         raise MapError("the model has no points", path=model_dir, fix=fix)
     arrays = model_arrays(model)
     own_centers = camera_centers(arrays.image_poses)
@@ -278,8 +278,7 @@ def features_of(
     Raises MapError if neither features nor photographs are known, or the photographs are not those of the model.
     """
     if images is None and database is None:
-        database = find_features(model_dir)
-        images = find_photographs(model_dir) if database is None else None
+        database, images = find_source(model_dir)
         LOG.info("%s: %s", "features" if database else "photographs", database or images or "not found")
     if database is not None:
         return model_dir, database

@@ -152,9 +152,13 @@ def load_colmap_landmarks(
     worst_px = np.inf if max_reprojection_error_px is None else max_reprojection_error_px
     keep = observed & (model.errors_px <= worst_px)
     if not keep.any():
-        problem = f"the model has no points with a track and a reprojection error of at most {worst_px:g} px"
         value = f"{len(observed)} points, {observed.sum()} with a track"
-        fix = "Triangulate the model, raise max_reprojection_error_px, or check its intrinsics and poses."
+        if observed.any():
+            problem = f"the model has no points with a track and a reprojection error of at most {worst_px:g} px"
+            fix = "Raise max_reprojection_error_px, or check the model's intrinsics and poses."
+        else:
+            problem = "the model has no points with a track: which images observe which points is unknown"
+            fix = f"`wheretolook map --model {model_dir} --images PHOTOGRAPHS` triangulates it."
         raise MapError(problem, path=model_dir, value=value, fix=fix)
     if not keep.all():
         text = (

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 import warnings
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -88,6 +90,44 @@ def find_photographs(model_dir: Path) -> Path | None:
     folders = [path for folder in _above(model_dir) if (path := folder / "images").is_dir()]
     names = [*registered_names(read_model(model_dir)).values()] if folders else []
     return next((folder for folder in folders if any(has_image(folder, name) for name in names)), None)
+
+
+def find_source(model_dir: Path) -> tuple[Path | None, Path | None]:
+    """Find the features of a model, or without any that describe its keypoints the folder of its photographs.
+
+    A model of undistorted images, for example, has other keypoints than the database above it, and a model without
+    points needs its photographs. Returns features and folder, of which one or both are None.
+    """
+    model = read_model(model_dir)
+    features = find_features(model_dir, model)
+    problem = f"{model_dir} has no points"
+    if features is not None and model.num_points3D():
+        problem = _kind_or_problem(features, model)[1]
+        if not problem:
+            return features, None
+    photographs = find_photographs(model_dir)
+    if photographs is None:
+        return features, None
+    if features is not None:
+        LOG.info("features not used: %s", problem)
+    return None, photographs
+
+
+def find_mesh(model_dir: Path) -> Path | None:
+    """Find a mesh next to a model: GLB, OBJ or PLY with faces, in its folder or the two above; None without any."""
+    for folder in (model_dir, *_above(model_dir)[:2]):
+        for path in sorted(folder.glob("*")):
+            suffix = path.suffix.lower()
+            if path.is_file() and (suffix in (".glb", ".obj") or (suffix == ".ply" and _has_faces(path))):
+                return path
+    return None
+
+
+def _has_faces(path: Path) -> bool:
+    """Return whether a PLY file has faces, by its header; COLMAP's fused.ply is a cloud of points."""
+    with suppress(OSError), path.open("rb") as file:
+        return re.search(rb"element face [1-9]", file.read(4096)) is not None
+    return False
 
 
 def has_image(folder: Path, name: str) -> bool:
@@ -224,7 +264,9 @@ class Map:
                 raise MapError(problem, path=stored, fix="Give --database, or run the map stage again.")
             landmarks = replace(landmarks, descriptors=kept.descriptors, described_by=kept.described_by)
         if landmarks.descriptors is None:
-            fix = "Give --database: the model's database.db, or hloc's feats-*.h5."
+            photographs = find_photographs(path) or "PHOTOGRAPHS"
+            fix = "Give --database: the model's database.db, or hloc's feats-*.h5. Without these, "
+            fix += f"`wheretolook map --model {path} --images {photographs}` makes a map with features."
             raise MapError("the landmarks have no descriptors, so nothing can be localized", path=path, fix=fix)
         return cls._of_model(path, model, arrays, landmarks, found)
 

@@ -356,7 +356,7 @@ def test_an_assumed_focal_length_that_a_wall_does_not_determine_makes_the_pose_u
     points = a_room(2000)
     points[:, 0] = 4.0  # a wall, which the camera faces: distance and focal length are exchangeable
     poses, (look,), _ = looks_from(points, axes=((1, 0, 0),), noise_px=0.5)
-    localizer = JointLocalizer(PoseEstimator(points))
+    localizer = JointLocalizer(PoseEstimator(points, LocalizerConfig(method="hypotheses")))
     known = localizer.localize([look])
     assert known.deviation[0] < 0.02
     for ratio in (0.9, 1.0):

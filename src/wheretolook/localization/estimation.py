@@ -142,7 +142,7 @@ def refine_jointly(
         turns = Rotation.from_rotvec(step[7:].reshape(-1, 3)).as_matrix() @ turns
         if with_focal:
             looks = [look.scaled(float(np.exp(step[6]))) for look in looks]
-        if np.abs(step).max() < (1e-5 if with_focal else 1e-9):  # metres and radians
+        if np.abs(step).max() < (1e-4 if with_focal else 1e-9):  # metres and radians
             break
     return looks, rig, turns @ compose_poses(cam_from_rig, rig), normal
 
@@ -303,6 +303,7 @@ class Hypothesis:
             best = refined
             if same:
                 break
+        normal[6, 6] += 0.01  # a wall that the camera faces does not determine it
         covariance = np.linalg.pinv(normal, hermitian=True)
         by_focal = covariance[:6, 6] / covariance[6, 6]
         look = next(look for look in best.rig.looks if look.focal is not None)
@@ -370,7 +371,7 @@ class RigMatches:
             rig = RigMatches(self.estimator, looks, self.turn_noise_deg)
             if sum(len(look.rows) for look in looks) < MIN_MATCHES:
                 return hypothesis
-            hypothesis = rig.refine(hypothesis.rig_from_world).with_focal()
+            hypothesis = rig.refine(hypothesis.rig_from_world)
         return hypothesis
 
     @cached_property

@@ -17,7 +17,7 @@ from functools import cache
 from importlib.metadata import entry_points
 from pathlib import Path
 from pkgutil import resolve_name
-from typing import Any, get_type_hints
+from typing import Any, get_args, get_type_hints
 
 from wheretolook.utils.errors import ConfigError, WhereToLookError, did_you_mean
 from wheretolook.utils.files import MAX_PIXELS, read_yaml
@@ -255,6 +255,8 @@ def parse_command(name: str, arguments: Sequence[str]) -> Any:
     values: dict[str, Any] = {}
     for settings in (*(read_settings(or_shipped(file), command, options) for file in files), given):
         for option, value in settings.items():
+            if value is None and type(None) not in (options[option], *get_args(options[option])):
+                raise ConfigError("this option needs a value", path=", ".join(files), value=option)
             former = values.get(option)
             values[option] = {**former, **value} if isinstance(former, dict) and isinstance(value, dict) else value
     parser = build_parser(name)
@@ -356,7 +358,8 @@ def read_arguments(
         if found is None:
             if hasattr(command, "root") and "." in name and option_of(name, configurable_options()):
                 continue  # of a group of another command: the same options may be given to all
-            fix = did_you_mean(name, [*known, *command.SHORT], "--")
+            meant = {"top": "n", "num": "n", "k": "n"}.get(name, name)  # of the best views
+            fix = did_you_mean(meant if meant in known else name, [*known, *command.SHORT], "--")
             raise ConfigError("unknown option", value=option, fix=fix)
         value = with_keys(name, found, read_value(option, str(options.get(found)), texts, found == "print_config"))
         if found == "config":

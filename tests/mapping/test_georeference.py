@@ -28,7 +28,7 @@ from wheretolook.mapping.georeference import (
     scale_from_positions,
 )
 from wheretolook.rendering.warp_renderer import WarpRenderer
-from wheretolook.utils.errors import ConfigError, MapError
+from wheretolook.utils.errors import ConfigError, MapError, TableError
 
 SQUARE = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], dtype=np.float64)
 
@@ -109,9 +109,19 @@ def test_tables_of_markers_and_positions_are_read(tmp_path):
     table = tmp_path / "markers.csv"
     table.write_text("id, size_m\n3, 0.4\n7, 0.2\n7, 0.2\n")
     assert read_marker_table(table) == {3: 0.4, 7: 0.2}
-    for name, text in (("p.csv", "image,x,y,z\na.jpg,1,2,3\n"), ("p.json", '{"a.jpg": [1, 2, 3]}')):
-        (tmp_path / name).write_text(text)
-        assert_array_equal(read_positions(tmp_path / name)["a.jpg"], (1, 2, 3))
+    for text in (
+        "image,x,y,z\na.jpg,1.5,2,3\n",
+        '{"a.jpg": [1.5, 2, 3]}',
+        "a.jpg 1.5 2 3\n",  # COLMAP's
+        "#Label,X/Easting,Y/Northing,Z/Altitude,Yaw\na.jpg,1.5,2,3,0\n# <label,x,y,z>\n",  # Agisoft's
+        "Label\tX [m]\tY [m]\tZ [m]\na.jpg\t1.5\t2\t3\n",
+        "image;x;y;z\na.jpg;1,5;2,0;3\n",
+        "1 1 0 0 0 -1.5 -2 -3 1 a.jpg\n",
+    ):
+        (tmp_path / "p").write_text(text)
+        assert_array_equal(read_positions(str(tmp_path / "p"))["a.jpg"], (1.5, 2, 3))
+    (tmp_path / "p").write_text("image;x;y;z\na,b.jpg;1,5;2,0;3\n")
+    assert [*read_positions(tmp_path / "p")] == ["a,b.jpg"]
 
 
 @pytest.mark.parametrize(
@@ -120,14 +130,17 @@ def test_tables_of_markers_and_positions_are_read(tmp_path):
         *[("m.csv", f"id,size_m\n{rows}") for rows in ("3,0.4\n3,0.2\n", "", "x,0.4\n", "3,-1\n", "3\n")],
         ("m.csv", "id,width\n3,0.4\n"),
         ("p.csv", "image,x,y,z\na.jpg,1,2,3\na.jpg,1,2,4\n"),
+        ("p.csv", "x,y,z\n1,2,3\n"),
+        ("p.csv", "label,x/longitude,y/latitude,z/altitude\na.jpg,11.5,48.1,500\n"),
         *[("p.json", text) for text in ('{"a.jpg": [1, 2]}', '{"a.jpg": "x"}', "[1]", "{")],
+        ("p.json", '{"a.jpg": [1, 2, 3], "a.jpg": [1, 2, 4]}'),
         ("p.csv", None),
     ],
 )
 def test_invalid_tables_are_rejected(tmp_path, name, text):
     if text is not None:
         (tmp_path / name).write_text(text)
-    with pytest.raises(ConfigError):
+    with pytest.raises(TableError):
         (read_marker_table if name[0] == "m" else read_positions)(tmp_path / name)
 
 

@@ -54,6 +54,7 @@ BROKEN = {
         .replace(b"vertex 4", b"vertex 300000000")
     },
     "a vertex out of range": {"a.obj": obj(faces="f 1 2 99\n")},
+    "a vertex before the first": {"a.obj": obj(faces="f 1 2 -9\n")},
     "too many parts": {"a.obj": obj(faces="".join(f"usemtl m{i}\nf 1 2 3\n" for i in range(20_000)))},
     "a library that is a device": {"a.obj": obj("mtllib /dev/zero\n")},
     "a texture that is a device": {"a.obj": obj(USING), "a.mtl": b"newmtl a\nmap_Kd /dev/zero\n"},
@@ -140,6 +141,86 @@ def few_uvs(tree, _):
     at = tree["meshes"][0]["primitives"][0]["attributes"]["TEXCOORD_0"]
     tree["accessors"][at]["count"] = 2
     return tree
+
+
+def quantized(kind):
+    """Positions, which a node scales back, and texture coordinates become normalized integers in rows of four."""
+
+    def change(tree, buffer):
+        (primitive,) = tree["meshes"][0]["primitives"]
+        for name, columns in (("POSITION", 3), ("TEXCOORD_0", 2)):
+            accessor = tree["accessors"][primitive["attributes"][name]]
+            start = tree["bufferViews"][accessor["bufferView"]].get("byteOffset", 0) + accessor.get("byteOffset", 0)
+            values = np.frombuffer(buffer, "<f4", accessor["count"] * columns, start).reshape(-1, columns)
+            stored = np.zeros((len(values), 4), kind)
+            stored[:, :columns] = np.rint(values / {3: 4, 2: 1}[columns] * np.iinfo(kind).max)
+            row = {"byteStride": 4 * stored.itemsize, "byteLength": stored.nbytes, "byteOffset": len(buffer)}
+            buffer += stored.tobytes()
+            number = {"int8": 5120, "uint8": 5121, "int16": 5122, "uint16": 5123}[kind]
+            accessor |= {"bufferView": len(tree["bufferViews"]), "byteOffset": 0}
+            accessor |= {"componentType": number, "normalized": True}
+            tree["bufferViews"].append({"buffer": 0, **row})
+        tree["nodes"] = [{"mesh": 0, "scale": [4, 4, 4]}]
+        tree["scenes"] = [{"nodes": [0]}]
+        tree["extensionsRequired"] = tree["extensionsUsed"] = ["KHR_mesh_quantization"]
+        return embedded(tree, buffer)
+
+    return change
+
+
+@pytest.mark.parametrize("kind", ["int8", "uint8", "int16", "uint16"])
+def test_normalized_integers_are_fractions_of_the_largest(whole, kind):
+    expected = load_mesh(whole)
+    rewrite(whole, quantized(kind))
+    mesh = load_mesh(whole)
+    step = 1 / np.iinfo(kind).max
+    np.testing.assert_allclose(mesh.vertices, expected.vertices, atol=2.01 * step)
+    np.testing.assert_allclose(mesh.corner_uvs, expected.corner_uvs, atol=0.51 * step + 1e-6)
+    np.testing.assert_array_equal(mesh.textures[0], expected.textures[0])
+
+
+def compressed(tree, _):
+    """As Draco leaves a file: accessors without data, and the extension with that."""
+    primitive = tree["meshes"][0]["primitives"][0]
+    primitive["extensions"] = {"KHR_draco_mesh_compression": {"bufferView": 0, "attributes": {"POSITION": 0}}}
+    position = tree["accessors"][primitive["attributes"]["POSITION"]]
+    del position["bufferView"]
+    return tree
+
+
+def with_extension(name, required=True):
+    return lambda tree, _: {**tree, "extensionsUsed": [name]} | ({"extensionsRequired": [name]} if required else {})
+
+
+def as_fans(tree, _):
+    tree["meshes"][0]["primitives"][0]["mode"] = 6
+    return tree
+
+
+@pytest.mark.parametrize(
+    ("change", "value"),
+    [
+        (compressed, "KHR_draco_mesh_compression"),
+        (with_extension("EXT_meshopt_compression"), "EXT_meshopt_compression"),
+        (with_extension("EXT_mesh_gpu_instancing", required=False), "EXT_mesh_gpu_instancing"),
+        (as_fans, "triangle fans"),
+    ],
+)
+def test_geometry_that_is_not_read_is_named(whole, change, value):
+    rewrite(whole, change)
+    with pytest.raises(SceneError) as caught:
+        load_mesh(whole)
+    assert caught.value.value == value
+
+
+def test_indices_of_obj_may_count_back_from_their_line(tmp_path):
+    (tmp_path / "a.obj").write_bytes(
+        obj(faces="vt 0 0\nf -4/-2 -3/-1 -2/1\nv 2 0 1 1 0 0\nf -5/-1 4/-1 -1/-1\nf 1 2 -1\n")
+    )
+    (tmp_path / "b.obj").write_bytes(obj(faces="vt 0 0\nv 2 0 1 1 0 0\nf 1/1 2/2 3/1\nf 1/2 4/2 5/2\nf 1 2 5\n"))
+    found, expected = (load_mesh(tmp_path / name) for name in ("a.obj", "b.obj"))
+    np.testing.assert_array_equal(found.vertices[found.triangles], expected.vertices[expected.triangles])
+    assert len(found.triangles) == 3
 
 
 @pytest.mark.parametrize("change", [with_image(uri(png())), with_image("picture.png"), embedded])

@@ -28,12 +28,13 @@ def at(tmp_path, monkeypatch):
 
 def test_views_and_scores_of_poses(sparse, at, capsys):
     given = ["--map", str(sparse), "--weights", str(WEIGHTS), "--device", "cpu"]
-    for name in ("views.csv", "views.tum"):
-        assert main(["select", "--at", "at.csv", "--out", name, "--directions", "60", *given]) == 0
+    written = {"views.csv": [], "views.tum": [], "views.json": [], "p.txt": ["--format", "benchmark"], "folder": []}
+    for name, options in written.items():
+        assert main(["select", "--at", "at.csv", "--out", name, "--directions", "60", *options, *given]) == 0
         assert "views: 4 in" in capsys.readouterr().out
     expected = pd.read_csv("views.csv")
     np.testing.assert_allclose(expected[["x", "y", "z"]], POINTS)
-    for name in ("views.csv", "views.tum"):
+    for name in written:
         assert main(["score", "--poses", name, "--out", "scores.csv", *given]) == 0
         found = pd.read_csv("scores.csv")
         np.testing.assert_allclose(found["score"], expected["score"], atol=1e-5)
@@ -44,8 +45,11 @@ def test_views_and_scores_of_poses(sparse, at, capsys):
     assert main(["score", "--poses", "far.tum", "--out", "scores.csv", "--skip", *given]) == 0
     assert pd.read_csv("scores.csv")["waypoint"].tolist() == [0, 1, 2, 3]
     Path("robot.tum").write_text("".join(f"{row} {x} {y} {z} 0 0 0 1\n" for row, (x, y, z) in enumerate(POINTS)))
-    with pytest.warns(MapWarning, match="every camera looks up"):
+    with pytest.warns(MapWarning, match="robot's base"):
         assert main(["score", "--poses", "robot.tum", "--out", "scores.csv", *given]) == 0
+    assert pd.read_csv("scores.csv")["pitch_deg"].tolist() == [0] * 4
+    assert main(["score", "--poses", "robot.tum", "--frame", "camera", "--out", "scores.csv", *given]) == 0
+    assert pd.read_csv("scores.csv")["pitch_deg"].tolist() == [90] * 4
 
 
 def test_a_floor_plan(sparse, at, look):
@@ -78,6 +82,7 @@ def test_a_sequence_and_a_grid(sparse, at):
         "--map SPARSE --at gone.csv", "--map SPARSE --at 1,2,300", "--map SPARSE --at at.csv --format xml",
         "--map SPARSE --at at.csv --camera MAGIC,1,2", "--map SPARSE --at at.csv --fov 60 --camera-id 1",
         "--map SPARSE --at at.csv --fov 60 --size big", "--map SPARSE --at at.csv --nn 2",
+        "--map SPARSE --at 1 2 1.5",
     ],
 )  # fmt: skip
 def test_invalid_arguments_exit_with_two_and_one_line(arguments, sparse, at, capsys):

@@ -21,10 +21,11 @@ from wheretolook.commands.sample import Sample
 from wheretolook.commands.viewpoint_map import BuildViewpointMap
 from wheretolook.dataset.config import SampleConfig
 from wheretolook.dataset.layout import Dataset, SceneFolder
-from wheretolook.dataset.scene import Scene
+from wheretolook.dataset.scene import ColmapFiles, Scene
 from wheretolook.features.extractor import ExtractorConfig
 from wheretolook.geometry.camera import CameraConfig, PinholeCamera
 from wheretolook.geometry.poses import camera_centers, poses_looking_along, transform
+from wheretolook.geometry.similarity import Similarity
 from wheretolook.geometry.views import Views
 from wheretolook.mapping.colmap_model import colmap_poses, read_model
 from wheretolook.mapping.config import FrameOptions, ImportConfig, MarkerConfig, PhotographsConfig
@@ -151,6 +152,22 @@ def test_a_scene_is_replaced_by_no_other_source(tmp_path):
     assert (scene.map / "points3D.bin").read_bytes() == content
 
 
+def test_a_mesh_is_turned_and_must_overlap_with_the_map(tmp_path):
+    folder = save(room_model(), tmp_path / "flat")
+    mesh = empty_room()
+    point = [[3.0, 2.5, 1.5]]
+    expected = MeshRaycaster(mesh).distance_to_surface(point, 10.0)
+    y_up = Similarity(1.0, np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]), np.zeros(3))
+    save_glb(mesh.transformed(y_up), tmp_path / "y.glb")
+    save_glb(mesh.transformed(Similarity(1.0, np.eye(3), np.array([0, 40.0, 0]))), tmp_path / "far.glb")
+    files = ColmapFiles(folder, tmp_path / "y.glb", frame=FrameOptions(scale=1, up="z"))
+    for name in ("y.glb", "far.glb"):
+        with pytest.raises(SceneError, match="overlap"):
+            _ = Scene(replace(files, mesh=tmp_path / name)).mesh_space
+    turned = Scene(replace(files, mesh_up="y")).raycaster
+    np.testing.assert_allclose(turned.distance_to_surface(point, 10.0), expected, atol=1e-5)
+
+
 def test_one_of_several_cameras_is_chosen(tmp_path):
     folder = save(room_model(cameras=(LOOKS, OTHER)), tmp_path / "flat")
     with pytest.raises((ConfigError, MapError)):
@@ -218,7 +235,7 @@ def test_landmarks_are_triangulated_again_at_known_poses(tmp_path):
     markers = MarkerConfig(marker_size_m=MARKERS[0].size_m)
     config = ImportConfig(tmp_path / "photos", scale=markers, model=folder, frame=FrameOptions(up="z"))
     report = map_existing(config, tmp_path / "map", tmp_path / "work", progress=False)
-    assert report.triangulated_anew and report.has_descriptors and report.n_points == 0
+    assert report.retriangulated and report.has_descriptors and report.n_points == 0
     assert report.scale.source == "markers" and report.scale.factor == pytest.approx(1, abs=0.005)
     found = read_model(tmp_path / "map")
     assert found.num_points3D() == report.n_landmarks > 1000

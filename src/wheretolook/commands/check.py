@@ -203,7 +203,7 @@ class Check(ScorerOptions, FrameOptions):
         folder, features = features_of(model, self.images, self.database, work, workers, device, self._extractor())
         name = self.scene or place_name(model)
         photographs = replace(open_map(folder, features, name, frame, model), fov_deg=self.fov)
-        files = ColmapFiles(model, mesh=mesh, frame=frame)
+        files = ColmapFiles(model, mesh=mesh, mesh_up=self.mesh_up, frame=frame)
         camera_id = next(iter(photographs.model.cameras))  # occlusion depends on none
         opened = Scene.of_colmap(files, camera_id, self.occlusion, device=device)
         return photographs, opened.occlusion

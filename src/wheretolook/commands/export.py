@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 
-from wheretolook.commands.options import CameraOptions
+from wheretolook.commands.options import CameraOptions, MeshOptions
 from wheretolook.dataset.config import checked_accuracy
 from wheretolook.dataset.scene import ColmapFiles, Scene
 from wheretolook.looks.next_look import mean_scores_by_pitch
@@ -20,7 +20,7 @@ MAX_LOCATIONS = 20_000
 
 
 @dataclass(frozen=True, kw_only=True)
-class Export(CameraOptions, FrameOptions):
+class Export(CameraOptions, MeshOptions, FrameOptions):
     """Export what a robot needs to score views of a map with NumPy and onnxruntime, without PyTorch.
 
     The folder then holds the network (scorer.onnx), the landmarks (landmarks.npz), the camera (robot.json), and
@@ -39,7 +39,6 @@ class Export(CameraOptions, FrameOptions):
         out: folder to write.
         weights: file of weights of the method set; by default the bundled ones for the features of the map.
         database: the map's database, as of `wheretolook select`.
-        mesh: a mesh of the scene, for occlusion.
         spacing: of the grid, in metres.
         accuracy: limits of the errors in metres and degrees that scores refer to; by default those of the weights,
             0.05,0.4. In a map of unknown unit, metres are those of a median depth of 5 m.
@@ -53,7 +52,6 @@ class Export(CameraOptions, FrameOptions):
     out: Path
     weights: Path | None = None
     database: Path | None = None
-    mesh: Path | None = None
     spacing: float = 0.5
     accuracy: tuple[float, float] | None = None
     localize: bool = False
@@ -69,7 +67,9 @@ class Export(CameraOptions, FrameOptions):
         """Write the robot's folder."""
         from wheretolook.robot.export import export_robot, pinhole_of
 
-        files = ColmapFiles(self.map, mesh=self.mesh, database=self.database, frame=self.frame_options())
+        files = ColmapFiles(
+            self.map, mesh=self.mesh, mesh_up=self.mesh_up, database=self.database, frame=self.frame_options()
+        )
         occlusion = "none" if self.mesh is None else "mesh"
         scene = Scene.of_colmap(files, self.named_camera(), occlusion=occlusion)
         source = scene.localization_map

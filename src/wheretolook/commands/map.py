@@ -17,6 +17,7 @@ from wheretolook.commands.options import (
     DatasetOptions,
     LabelOptions,
     Log,
+    MeshOptions,
     Progress,
     SceneOptions,
     existing,
@@ -313,7 +314,7 @@ def _import_model(options: BuildMap, log: Log) -> tuple[SceneFolder, Dataset]:
         save_glb(loaded, scene.mesh)
     cache.store()
     removed = f", {report.n_landmarks_removed:,} points removed" if report.n_landmarks_removed else ""
-    again = ", triangulated again," if report.triangulated_anew else ""
+    again = ", triangulated again," if report.retriangulated else ""
     log(f"{scene.name}: {report.n_landmarks:,} landmarks{again} from {report.n_images} images{removed} -> {scene.map}")
     return scene, dataset
 
@@ -378,20 +379,18 @@ def _with_scene(scene: SceneFolder, root: Path) -> Dataset:
 
 
 @dataclass(frozen=True, kw_only=True)
-class SceneOrMapOptions(SceneOptions, FrameOptions):
+class SceneOrMapOptions(MeshOptions, SceneOptions, FrameOptions):
     """A scene of a dataset, or a COLMAP model.
 
     Args:
         name: name of the dataset; by default demo, or with --map that of the map.
         map: instead of a scene: folder of a COLMAP model, imported first as `wheretolook map --model` does.
-        mesh: a mesh of the map's scene (GLB, OBJ, PLY) in its frame.
         database: the map's features: COLMAP's database.db, or hloc's feats-*.h5.
         camera_id: the camera_id of one of the map's cameras, if it has several.
     """
 
     name: str = ""
     map: Path | None = None
-    mesh: Path | None = None
     database: Path | None = None
     camera_id: int | None = None
 

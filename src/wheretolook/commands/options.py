@@ -300,11 +300,23 @@ class CameraOptions(Command):
 
 
 @dataclass(frozen=True, kw_only=True)
-class ScorerOptions(Command):
+class MeshOptions(Command):
+    """A mesh of a map's scene.
+
+    Args:
+        mesh: a mesh of the map's scene (GLB, OBJ, PLY) in its frame.
+        mesh_up: which axis of the mesh's file is the map's z: x, y or z, with a minus sign if it points down.
+    """
+
+    mesh: Path | None = None
+    mesh_up: str = "z"
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScorerOptions(MeshOptions):
     """How views are scored.
 
     Args:
-        mesh: a mesh of the scene (GLB, OBJ, PLY) in the map's frame.
         occlusion: mesh, tsdf (depth images), hidden-points (from the landmarks alone) or none; by default the first of
             these that there is data for.
         weights: file or folder of weights; by default the bundled ones.
@@ -314,7 +326,6 @@ class ScorerOptions(Command):
         anywhere: allow weights adapted to another scene.
     """
 
-    mesh: Path | None = None
     occlusion: str | None = None
     weights: Path | None = None
     method: str = ""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 import warnings
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
@@ -13,6 +13,7 @@ from wheretolook.commands.options import CameraOptions, ScorerOptions
 from wheretolook.dataset.config import checked_accuracy
 from wheretolook.figures import KINDS
 from wheretolook.geometry.camera import PinholeCamera, describe_camera, parse_size
+from wheretolook.geometry.pose_files import poses_of_rows, read_named_rows
 from wheretolook.geometry.views import Views, check_format
 from wheretolook.mapping.colmap_model import model_suffix
 from wheretolook.mapping.config import FrameOptions
@@ -44,11 +45,14 @@ class SelectorOptions(CameraOptions, ScorerOptions, FrameOptions):
             hloc's near the model, or a database near it of other features than SIFT.
         max_error: leave out landmarks with a larger mean reprojection error, in pixels.
         device: where to compute: auto, cpu, cuda, or cuda:<index>.
+        frame: whose orientations a trajectory or table holds: base (x forward, z up) or camera (z forward). By default
+            that of a base if all its z axes are within 45 degrees of up.
     """
 
     map: Path
     out: Path
     format: str | None = None
+    frame: Literal["base", "camera"] | None = None
     floor_plan: Path | None = None
     fov: float | None = None
     size: str | None = None
@@ -94,6 +98,7 @@ class SelectorOptions(CameraOptions, ScorerOptions, FrameOptions):
                 method=self.method,
                 camera=self.named_camera(),
                 mesh=self.mesh,
+                mesh_up=self.mesh_up,
                 depth=self.depth,
                 depth_scale=self.depth_scale,
                 occlusion=self.occlusion,
@@ -118,6 +123,8 @@ def finish(command: SelectorOptions, selector: WhereToLook, views: Views, given:
         print(f"floor plan: {command.floor_plan}")
 
     localization_map = selector.localization_map
+    if views.read_as is not None:
+        print(f"{locations} read as {views.read_as[0]}")
     print(f"{selector.frame.describe()}; camera: {describe_camera(localization_map.camera)}")
     n_used = len({*views.waypoint.tolist()})
     skipped = f", {given - n_used} left out" if n_used < given else ""
@@ -140,15 +147,16 @@ def finish(command: SelectorOptions, selector: WhereToLook, views: Views, given:
 class Select(SelectionRequest, SelectorOptions):
     """Select the best views at waypoints of your own COLMAP model; needs no dataset.
 
-    Waypoints (--at):
-      CSV          columns x, y, z, and id if there is one; with a line of names or without (then x,y,z alone)
-      benchmark    "id x y z", the waypoints of the Active Localization Benchmark; or "x y z"
+    Waypoints (--at); the format is recognized by the content:
+      CSV          columns x, y, z, and id if there is one; with a line of names or without
+      text         "id x y z", such as the waypoints of the Active Localization Benchmark; or "x y z"
       TUM          "t x y z qx qy qz qw"; the views keep the time stamps
-      COLMAP       images.txt, world-to-camera: the camera centres
+      KITTI        matrices of 12 numbers, camera-to-world
+      COLMAP       images.txt, images.bin or the folder of a model: the camera centres; hloc's results
       numbers      --at 1,2,1.5 -0.5,2,1.5
 
     Headings (for --pan): the column heading_deg or yaw_deg, or the orientation, of a TUM trajectory or in columns
-    qw, qx, qy, qz: that of a camera (z forward), or of a robot (x forward, z up).
+    qw, qx, qy, qz: that of a camera (z forward), or of a robot (x forward, z up): --frame.
 
     Frames: the world of waypoints and views is the map's own frame, in its unit. Camera: x right, y down, z forward; it
     does not roll. yaw_deg is 0 along the map's x and 90 along y, of an upright map; pitch_deg is 90 straight up.
@@ -220,7 +228,7 @@ class Select(SelectionRequest, SelectorOptions):
     def _waypoints(self) -> Waypoints | None:
         """Return the waypoints, None for a grid."""
         if len(self.at) == 1 and (Path(self.at[0].strip()).exists() or self.at[0].count(",") != 2):
-            return read_waypoints(self.at[0].strip())
+            return read_waypoints(self.at[0].strip(), self.frame)
         return parse_points(self.at) if self.at else None
 
 
@@ -228,11 +236,14 @@ class Select(SelectionRequest, SelectorOptions):
 class Score(SelectorOptions):
     """Score poses of your own in a COLMAP model; needs no dataset.
 
-    Poses (--poses), in the frame of the map; camera x right, y down, z forward:
+    Poses (--poses), in the frame of the map; camera x right, y down, z forward, or a robot's base (--frame), whose camera
+    looks along x. The format is recognized by the content:
       CSV          x, y, z, qw, qx, qy, qz or TUM's tx, ty, tz, qx, qy, qz, qw: camera-to-world; COLMAP's
                    qw, qx, qy, qz, tx, ty, tz: world-to-camera; and a name: id, waypoint, name, t or timestamp
-      TUM          "t x y z qx qy qz qw", camera-to-world
-      COLMAP       images.txt, world-to-camera
+      JSON         as select writes it
+      TUM          "t x y z qx qy qz qw", camera-to-world; KITTI's matrices of 12 numbers
+      COLMAP       images.txt, images.bin or the folder of a model, world-to-camera
+      hloc         results "name qw qx qy qz tx ty tz", world-to-camera
 
     The file of results has the columns and formats of `wheretolook select`, a row for each pose.
 
@@ -241,7 +252,7 @@ class Score(SelectorOptions):
       wheretolook score --map sparse/0 --poses sparse/0/images.txt --mesh house.glb --out scores.csv
 
     Args:
-        poses: file of the poses.
+        poses: file of the poses, or folder of a model.
         skip: leave out poses outside the map or inside geometry.
     """
 
@@ -254,15 +265,16 @@ class Score(SelectorOptions):
 
     def run(self) -> Views:
         """Score the poses, write them to `out` and print a summary."""
-        poses = Views.read(self.poses)
+        table = read_named_rows(self.poses)
+        poses_of_rows(table)  # an error about the file comes before the map is read
         selector = self.open_map()
+        poses = Views.of_rows(table, selector.frame.world_from_map.rotation[2], self.frame)
+        read_as = poses.read_as[0]
+        if self.frame is None and read_as != table.format:
+            text = f"read as {read_as}, with a camera that looks ahead; if these are a camera's, give --frame camera"
+            warnings.warn(f"{self.poses}: {text}", MapWarning, stacklevel=2)
         views = selector.report(poses.cam_from_world, poses.waypoint_id, self.skip)
-        # cameras do not all look up this steeply: the poses seem to be of a robot whose z is up
-        if (views.pitch_deg > 60.0).all():
-            text = (
-                "every camera looks up; are these a robot's orientations, x ahead and z up? Give its camera's, z ahead"
-            )
-            warnings.warn(f"{self.poses}: {text} and y down", MapWarning, stacklevel=2)
+        views = replace(views, read_as=(read_as,) * len(views))
         finish(self, selector, views, len(poses), "poses")
         print(f"scores: {self.out}")
         return views

@@ -6,7 +6,7 @@ import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from wheretolook.commands.options import CameraOptions
+from wheretolook.commands.options import CameraOptions, MeshOptions
 from wheretolook.dataset.layout import find_scene
 from wheretolook.mapping.config import FrameOptions
 from wheretolook.utils.devices import usable_device
@@ -15,7 +15,7 @@ from wheretolook.utils.package import reports, require
 
 
 @dataclass(frozen=True, kw_only=True)
-class View(CameraOptions, FrameOptions):
+class View(CameraOptions, MeshOptions, FrameOptions):
     """View a scene or your own map in the browser, with the score of every view.
 
     The page shows mesh or landmarks, mapping cameras, and free space at one height, coloured by the best score at each
@@ -41,7 +41,6 @@ class View(CameraOptions, FrameOptions):
         data: folder of the datasets.
         name: dataset of the scene, if several have such a scene.
         map: instead, folder of a COLMAP model.
-        mesh: a mesh of the map's scene (GLB, OBJ, PLY) in its frame.
         path: a path to show.
         pair: which start and goal of compared paths.
         weights: file or folder of weights; by default the scene's own, or the bundled ones.
@@ -59,7 +58,6 @@ class View(CameraOptions, FrameOptions):
     data: Path = Path("data")
     name: str = ""
     map: Path | None = None
-    mesh: Path | None = None
     path: Path | None = None
     pair: int = 0
     weights: Path | None = None
@@ -116,7 +114,9 @@ class View(CameraOptions, FrameOptions):
         device = usable_device(self.device)
         camera = self.named_camera()
         if self.map is not None:
-            viewed = open_map(self.map, self.mesh, camera, self.weights, device, self.data, self.frame_options())
+            viewed = open_map(
+                self.map, self.mesh, camera, self.weights, device, self.data, self.frame_options(), self.mesh_up
+            )
         else:
             assert self.scene is not None and not isinstance(camera, int)
             viewed = open_scene(self.data, self.scene, self.name, camera, self.weights, device)

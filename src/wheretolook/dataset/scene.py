@@ -32,7 +32,8 @@ if TYPE_CHECKING:  # pandas, torch and Warp are imported when first needed
     from wheretolook.inputs.localization_map import LocalizationMap
     from wheretolook.rendering.raycasting import MeshRaycaster
     from wheretolook.rendering.warp_renderer import Renderer
-    from wheretolook.space.free_space import FreeSpace, MappedSpace
+    from wheretolook.space.free_space import FreeSpace
+    from wheretolook.space.mapped_space import MappedSpace
     from wheretolook.visibility.occlusion import OcclusionModel
 
 
@@ -50,6 +51,7 @@ class ColmapFiles:
     database: Path | None = None  # COLMAP database or hloc features, for the landmarks' ambiguity
     max_reprojection_error_px: float | None = None  # landmarks with a larger mean error are dropped
     frame: FrameOptions = FrameOptions()  # how its frame is related to the world
+    mesh_up: str = "z"  # axis of the mesh's file that is the model's z
 
     def __post_init__(self) -> None:
         if self.mesh is not None and self.depth is not None:
@@ -171,11 +173,8 @@ class Scene:
 
     @cached_property
     def localization_map(self) -> LocalizationMap:
-        """The input of scorers, with `occlusion`; warns if the mesh of a COLMAP model seems to be in another frame."""
-        result = self.with_occlusion(self.occlusion)
-        if isinstance(self.files, ColmapFiles) and self.files.mesh is not None:
-            warn_of_mesh(self.files.mesh, self.landmarks.points, self.raycaster)
-        return result
+        """The input of scorers, with `occlusion`."""
+        return self.with_occlusion(self.occlusion)
 
     def with_occlusion(self, occlusion: OcclusionModel) -> LocalizationMap:
         """Return the input of scorers with an occlusion model."""
@@ -218,7 +217,7 @@ class Scene:
         if isinstance(self.files, SceneFolder):
             return load_mesh(self.files.mesh)
         assert self.files.mesh is not None
-        return load_mesh(self.files.mesh, colored=False).transformed(self.frame.world_from_map)
+        return load_mesh(self.files.mesh, self.files.mesh_up, colored=False).transformed(self.frame.world_from_map)
 
     @cached_property
     def depth_images(self) -> DepthImages:
@@ -248,15 +247,18 @@ class Scene:
 
     @cached_property
     def mesh_space(self) -> FreeSpace:
-        """Where a camera can be according to the mesh."""
+        """Where a camera can be according to the mesh; that of a COLMAP model is compared with the landmarks."""
         from wheretolook.space.free_space import FreeSpace
 
-        return FreeSpace(self.mesh, self.config.free_space, self.device)
+        space = FreeSpace(self.mesh, self.config.free_space, self.device)
+        if isinstance(self.files, ColmapFiles) and self.files.mesh is not None:
+            warn_of_mesh(self.files.mesh, self.landmarks.points, space.raycaster)
+        return space
 
     @cached_property
     def mapped_space(self) -> MappedSpace:
         """Where a camera can be according to landmarks and mapping images."""
-        from wheretolook.space.free_space import MappedSpace
+        from wheretolook.space.mapped_space import MappedSpace
 
         poses = np.empty((0, 3, 4)) if self.map.mapping_poses is None else self.map.mapping_poses
         return MappedSpace(self.landmarks.points, camera_centers(poses.astype(np.float64)), self.config.mapped_space)

@@ -12,10 +12,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from wheretolook.geometry.camera import Camera, write_cameras
-from wheretolook.geometry.pose_files import images_text, pose_texts, poses_of_rows, read_named_rows, tum_text
+from wheretolook.geometry.pose_files import (
+    CAM_FROM_BASE,
+    NamedRows,
+    images_text,
+    is_of_base,
+    pose_texts,
+    poses_of_rows,
+    read_named_rows,
+    tum_text,
+)
 from wheretolook.geometry.poses import Float, camera_centers, pan_tilt_angles, quaternion_from_rotation
 from wheretolook.utils.errors import ConfigError, StorageError, check_choice
 from wheretolook.utils.files import check_output_folder, write_json, write_text
@@ -67,6 +76,7 @@ class Views:
 
     waypoint: Column = None  # (V,) row of the location among those asked for, from 0
     waypoint_id: Column = None  # V names of the locations or of the poses
+    read_as: Column = None  # V times the format of the file that locations or poses were read from
     rank: Column = None  # (V,) 1 for the best view of the location, or the first to look along
     score: Column = None  # (V,) of the view on its own
     set_score: Column = None  # (V,) probability that all views of the location localize jointly
@@ -123,14 +133,23 @@ class Views:
 
     @classmethod
     def read(cls, path: str | Path) -> Views:
-        """Read poses and their names from a TUM trajectory, COLMAP's images.txt, or a CSV with a line of column names.
+        """Read poses and their names from a file or the folder of a model in any of `pose_files.FORMATS`.
 
-        A CSV holds x, y, z and qw, qx, qy, qz, or in this order tx, ty, tz, qx, qy, qz, qw (world_from_cam); or in this
+        A table holds x, y, z and qw, qx, qy, qz, or in this order tx, ty, tz, qx, qy, qz, qw (world_from_cam); or in this
         order qw, qx, qy, qz, tx, ty, tz (cam_from_world). Raises TableError, with the line, if the file is missing or
         holds no poses.
         """
-        table = read_named_rows(path)
-        return cls(poses_of_rows(table), waypoint_id=table.names)
+        return cls.of_rows(read_named_rows(path))
+
+    @classmethod
+    def of_rows(cls, table: NamedRows, up: ArrayLike = (0.0, 0.0, 1.0), frame: str | None = None) -> Views:
+        """Return the poses in rows; those of a robot's base, see `is_of_base`, as of a camera at its origin that looks along x."""
+        poses = poses_of_rows(table)
+        read_as = table.format
+        if is_of_base(table, poses, up, frame):
+            poses = CAM_FROM_BASE @ poses
+            read_as += ", of a robot's base: x forward, z up"
+        return cls(poses, waypoint_id=table.names, read_as=(read_as,) * len(poses))
 
     @property
     def positions(self) -> Float:
@@ -234,6 +253,8 @@ def _table(views: Views) -> dict[str, list[Any]]:
     columns |= {"yaw_deg": views.yaw_deg, "pitch_deg": views.pitch_deg}
     columns |= {name: values for name in WRITTEN if (values := getattr(views, name)) is not None}
     columns["scale"] = [views.frame.scale.source] * len(views)
+    if views.read_as is not None:
+        columns["read_as"] = views.read_as
     columns |= dict(zip(("qw", "qx", "qy", "qz"), views.quaternions_wxyz.T, strict=True))
     rows = {name: np.asarray(values, dtype=object).tolist() for name, values in columns.items()}
     return {name: [None if value != value else value for value in values] for name, values in rows.items()}
@@ -276,5 +297,5 @@ def _trajectory_text(views: Views) -> str:
         np.array(stamps, dtype=float)
     except ValueError:
         stamps = [str(row) for row in range(len(views))]
-    about = "# t x y z qx qy qz qw, camera-to-world, in the map's unit; t is the waypoint's name if that is a number, else a count"
-    return f"{about}\n{tum_text(stamps, views.cam_from_world)}"
+    about = "# camera-to-world, in the map's unit; t is the waypoint's name if that is a number, else a count"
+    return f"{about}\n# t x y z qx qy qz qw\n{tum_text(stamps, views.cam_from_world)}"

@@ -42,6 +42,7 @@ class LocalizationMap:
         model: str | Path,
         camera: Camera | int | None = None,
         mesh: str | Path | None = None,
+        mesh_up: str = "z",
         occlusion: OcclusionModel | None = None,
         max_reprojection_error_px: float | None = None,
         device: str = "cpu",
@@ -58,6 +59,7 @@ class LocalizationMap:
             camera: the camera to localize, which may differ from the mapping cameras: a camera, or the camera_id of one
                 of the model. None for the model's own, with its distortion, if it has but one.
             mesh: a mesh of the scene in the model's frame, for true occlusion.
+            mesh_up: which axis of the mesh's file is the model's z: "x", "y" or "z", with "-" if it points down.
             occlusion: another model, such as `HiddenPointRemoval()` where there is nothing but the landmarks, or
                 `TsdfOcclusion` where there are depth images. With neither, landmarks are seen through walls.
             max_reprojection_error_px: landmarks with a larger mean error are left out.
@@ -78,7 +80,7 @@ class LocalizationMap:
             from wheretolook.scenes.loading import load_mesh
 
             to_world = opened.frame.world_from_map
-            space = FreeSpace(load_mesh(Path(mesh), colored=False).transformed(to_world), device=device)
+            space = FreeSpace(load_mesh(Path(mesh), mesh_up, colored=False).transformed(to_world), device=device)
             occlusion = MeshOcclusion(space.raycaster, two_sided=space.two_sided)
             warn_of_mesh(mesh, opened.landmarks.points, space.raycaster)
         return cls(opened, camera, occlusion or NoOcclusion(), device)

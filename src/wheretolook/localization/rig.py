@@ -12,7 +12,15 @@ from scipy.spatial.transform import Rotation
 
 from wheretolook.features.matches import Matches
 from wheretolook.geometry.camera import Camera, field_of_view_deg
-from wheretolook.geometry.pose_files import NAME_COLUMNS, QUATERNION_COLUMNS, NamedRows, poses_of_rows, read_named_rows
+from wheretolook.geometry.pose_files import (
+    CAM_FROM_BASE,
+    NAME_COLUMNS,
+    QUATERNION_COLUMNS,
+    NamedRows,
+    is_of_base,
+    poses_of_rows,
+    read_named_rows,
+)
 from wheretolook.geometry.poses import Float, as_numbers, camera_centers, compose_poses, invert_poses, rigid_poses
 from wheretolook.geometry.similarity import Similarity
 from wheretolook.utils.errors import ConfigError, PoseError, TableError
@@ -106,9 +114,6 @@ def rig_of(cam_from_world: Float) -> Float:
     return cam_from_rig
 
 
-CAM_FROM_BODY = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])  # a camera that looks along x of a body whose z is up
-
-
 def read_turns(path: Path, images: Sequence[str]) -> Float:
     """Read cam_from_rig (N, 3, 4) of images, by their names; the rig's origin is the first image.
 
@@ -132,8 +137,8 @@ def _poses(table: NamedRows) -> Float:
     """Return cam_from_rig (R, 3, 4) of all rows."""
     if {*QUATERNION_COLUMNS} <= {*table.columns}:
         poses = poses_of_rows(table, orientations_only=True)
-        of_body = table.header[0] == "t" and (poses[:, 2, 2] > 0.7).all()  # z of the robot's z axis: upright
-        return CAM_FROM_BODY @ poses if of_body else poses
+        of_base = table.header[0] in ("t", "timestamp") and is_of_base(table, poses)
+        return CAM_FROM_BASE @ poses if of_base else poses
     angles = np.zeros((len(table.rows), 3))
     for column, name in enumerate(("yaw", "pitch", "roll")):
         given = [known for known in (name, f"{name}_deg") if known in table.columns]
@@ -142,7 +147,7 @@ def _poses(table: NamedRows) -> Float:
         elif name == "yaw":
             fix = "Give qw, qx, qy, qz, or yaw and perhaps pitch and roll in degrees."
             raise TableError("the columns state no rotation", path=table.path, value=",".join(table.header), fix=fix)
-    rotated = Rotation.from_euler("xz", -angles[:, 1:], degrees=True).as_matrix() @ CAM_FROM_BODY
+    rotated = Rotation.from_euler("xz", -angles[:, 1:], degrees=True).as_matrix() @ CAM_FROM_BASE
     rotations = rotated @ Rotation.from_euler("z", -angles[:, :1], degrees=True).as_matrix()
     return np.pad(rotations, ((0, 0), (0, 0), (0, 1)))
 

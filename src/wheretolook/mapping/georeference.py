@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
-from io import StringIO
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -13,13 +12,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from tqdm.auto import tqdm
 
+from wheretolook.geometry.pose_files import NAME_COLUMNS, NamedRows, locations_of_rows, read_named_rows
 from wheretolook.geometry.poses import Float, camera_centers
 from wheretolook.geometry.similarity import Similarity
 from wheretolook.mapping.colmap_model import ModelArrays
 from wheretolook.mapping.config import MARKER, SCALE_TOLERANCE_PERCENT, FrameOptions, MarkerConfig
 from wheretolook.mapping.photographs import read_photograph
-from wheretolook.utils.errors import ConfigError, MapError
-from wheretolook.utils.files import read_json_object, read_text
+from wheretolook.utils.errors import ConfigError, MapError, TableError
+from wheretolook.utils.files import read_json_object
 from wheretolook.utils.texts import LOG
 
 # A marker is rejected if the root mean square reprojection error of its corners exceeds both this many pixels and this
@@ -264,7 +264,7 @@ class MarkedPhotographs(NamedTuple):
 
 
 def check_tables(markers: MarkerConfig, frame: FrameOptions) -> None:
-    """Raise ConfigError if a table of markers or positions is not valid, or OpenCV lacks the markers' dictionary."""
+    """Raise TableError if a table of markers or positions is not valid, ConfigError if OpenCV lacks the dictionary."""
     if markers.has_sizes or frame.marker_ids:
         marker_detector(markers.dictionary)
     if markers.marker_table is not None:
@@ -413,7 +413,7 @@ def scale_from_positions(centers: Mapping[str, Float], positions: Mapping[str, F
         if removable == 0:
             limit = f"{limit_m:.3g} m, {SCALE_TOLERANCE_PERCENT:g} % of their extent"
             value = ", ".join(f"{name}: {residuals[name]:.3g} m" for name in wrong[:5])
-            fix = "Check the first one's position, and the units and names of all."
+            fix = "Check the first one's position, and the units (metres, not degrees) and names of all."
             raise MapError(f"the positions do not fit the map: errors exceed {limit}", value=value, fix=fix)
         names.remove(wrong[0])
         unused[wrong[0]] = f"{residuals[wrong[0]]:.3g} m off"
@@ -424,40 +424,35 @@ def scale_from_positions(centers: Mapping[str, Float], positions: Mapping[str, F
 def read_marker_table(path: Path) -> dict[int, float]:
     """Read the side in metres of each marker by its id, from a CSV file with the columns `id` and `size_m`.
 
-    Raises ConfigError if the file is missing or not such a table, or a marker has two sizes.
+    Raises TableError if the file is missing or not such a table, or a marker has two sizes.
     """
-    rows = _read_table(path, "id", ["size_m"])
+    table = read_named_rows(path)
+    rows = _by_name(table, table.numbers(["size_m"]))
     if not all(name.isdecimal() and size > 0 for name, (size,) in rows.items()):
-        raise ConfigError("not a table of markers' ids and positive sizes", path=path, fix="Write 7,0.15.")
+        raise TableError("not a table of markers' ids and positive sizes", path=path, fix="Write 7,0.15.")
     return {int(name): float(size) for name, (size,) in rows.items()}
 
 
-def read_positions(path: Path) -> dict[str, Float]:
-    """Read positions (3,) in metres by photograph, from CSV (`image`, `x`, `y`, `z`) or JSON (`{image: [x, y, z]}`).
+def read_positions(path: str | Path) -> dict[str, Float]:
+    """Read positions (3,) in metres by photograph, in any of `wheretolook.geometry.pose_files.FORMATS` with names.
 
-    Raises ConfigError if the file is missing or not such a table, or a photograph has two positions.
+    Raises TableError if the file is missing or not such a table, or a photograph has two positions.
     """
-    return _read_table(path, "image", ["x", "y", "z"])
+    table = read_named_rows(path)
+    LOG.info("positions: %s (%s)", path, table.format)
+    return _by_name(table, locations_of_rows(table))
 
 
-def _read_table(path: Path, key: str, columns: list[str]) -> dict[str, Float]:
-    """Read numbers by name from a CSV or JSON file. Raises ConfigError if it is none, or a name has two values."""
-    import pandas as pd
-
-    try:
-        if path.suffix.lower() == ".json":
-            table = pd.DataFrame.from_dict(read_json_object(path), orient="index", columns=columns)
-        else:
-            table = pd.read_csv(StringIO(read_text(path)), dtype=str, skipinitialspace=True, keep_default_na=False)
-            table = table.set_index(key)[columns]
-        table = table.astype(float).rename(index=str.strip)
-        if table.empty or not np.isfinite(table.to_numpy()).all():
-            raise ValueError("it is empty, or a number is missing or infinite")
-        if table.groupby(level=0).nunique().gt(1).any(axis=None):
-            raise ValueError("a name has different values")
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise ConfigError(f"not a file of {key}, {', '.join(columns)}: {error}", path=path) from error
-    return dict(zip(table.index, table.to_numpy(), strict=True))
+def _by_name(table: NamedRows, values: Float) -> dict[str, Float]:
+    """Return the values (N, C) of rows by name. Raises TableError if there are no names, or a name has two values."""
+    if not {*NAME_COLUMNS} & {*table.columns}:
+        fix = "Give a column image, such as image,x,y,z or 'a.jpg 1 2 3'."
+        raise TableError("the rows have no names", path=table.path, value=",".join(table.header), fix=fix)
+    result: dict[str, Float] = {}
+    for row, (name, value) in enumerate(zip(table.names, values, strict=True)):
+        if not np.array_equal(result.setdefault(name, value), value):
+            raise TableError("a name has different values", path=table.path, value=f"{table.label(row)}: {name}")
+    return result
 
 
 def read_scale(map_dir: Path) -> MapScale | None:

@@ -25,7 +25,7 @@ from wheretolook.mapping.georeference import (
     scale_from_depths,
     scale_from_positions,
 )
-from wheretolook.utils.errors import ConfigError, MapError, MapWarning
+from wheretolook.utils.errors import ConfigError, MapError, MapWarning, SceneError
 from wheretolook.utils.files import read_json_object
 
 if TYPE_CHECKING:
@@ -107,7 +107,20 @@ LOOKING_DOWN = 0.7  # mean of the cameras' axes along -z above which their roll 
 
 
 def warn_of_mesh(mesh: str | Path, points: ArrayLike, raycaster: MeshRaycaster) -> None:
-    """Issue a `MapWarning` if a map's landmarks (N, 3) m seem not to be in the frame or unit of a mesh."""
+    """Issue a `MapWarning` if a map's landmarks (N, 3) m seem not to be in the frame or unit of a mesh.
+
+    Raises SceneError if the box of the mesh and that of most landmarks do not overlap.
+    """
+    box = np.quantile(np.asarray(points, dtype=np.float64), (0.01, 0.99), axis=0)
+    shared = np.minimum(box[1], raycaster.bounds[1]) - np.maximum(box[0], raycaster.bounds[0])
+    # a floor that both share does not count
+    if (shared < 0.1 * np.minimum(np.ptp(box, axis=0), np.ptp(raycaster.bounds, axis=0))).any():
+        value = "; ".join(
+            f"{what} {_rounded(low)} to {_rounded(high)} m"
+            for what, (low, high) in (("mesh", raycaster.bounds), ("landmarks", box))
+        )
+        fix = "Export both in the same frame and unit; --mesh-up y turns a mesh with y up (glTF's own)."
+        raise SceneError("the mesh and the map do not overlap", path=mesh, value=value, fix=fix)
     if message := mesh_warning(points, raycaster):
         warnings.warn(f"{mesh}: {message}", MapWarning, stacklevel=2)
 
@@ -122,8 +135,7 @@ def mesh_warning(points: ArrayLike, raycaster: MeshRaycaster) -> str:
     far = f"{off_m:.2f} m or more" if np.isfinite(off_m) else f"more than {MESH_DISTANCE_M[1]:g} m"
     return (
         f"half of the landmarks are {far} from the mesh, so it seems to be in another frame or unit than the model. "
-        "Export both in the same frame and unit; a mesh with y up (glTF's own) `wheretolook map --model` "
-        "turns with --mesh-up y"
+        "Export both in the same frame and unit; --mesh-up y turns a mesh with y up (glTF's own)"
     )
 
 

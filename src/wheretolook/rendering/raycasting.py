@@ -112,6 +112,7 @@ class MeshRaycaster:
         wp.load_module(__name__, device=self.device)  # only one thread may do that
         self.warp_mesh = warp_mesh(mesh, self.device)
         self.origin = mesh.origin
+        self.bounds = mesh.bounds
 
     def occluded(self, origins: ArrayLike, points: ArrayLike, margin_m: float = 0.02) -> NDArray[np.bool_]:
         """Whether a surface is between each of origins (L, 3) and each of points (N, 3), in metres; (L, N).

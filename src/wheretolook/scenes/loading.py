@@ -6,8 +6,10 @@ import base64
 import hashlib
 import io
 import itertools
+import json
 import math
 import os
+import re
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -67,7 +69,11 @@ def load_mesh(path: str | PathLike[str], up: str = "z", colored: bool = True) ->
     file = _mesh_file(Path(path))
     _check_file(file)
     try:
-        scene = trimesh.load_scene(str(file), process=False)
+        source: Any = {".glb": _with_float_positions, ".obj": _with_positive_indices}.get(file.suffix.lower(), str)(
+            file
+        )
+        named = {"file_type": file.suffix[1:].lower(), "resolver": trimesh.resolvers.FilePathResolver(str(file))}
+        scene = trimesh.load_scene(source, process=False, **({} if source == str(file) else named))
         parts = list(_parts(scene))
     except Exception as error:  # trimesh's parsers raise errors of many kinds
         raise SceneError("the mesh cannot be read", path=file, value=str(error), fix="Check the file") from error
@@ -141,11 +147,11 @@ def _sibling(path: Path, name: str) -> Path:
 def _glb_textures(path: Path) -> Iterator[Path | bytes]:
     """Images of a binary glTF 2.0 file (specification, section 4.4): sibling files, or their content.
 
-    Raises ValueError for what makes trimesh run for minutes or fill the memory: many parts, and accessors without data.
+    Raises ValueError for what makes trimesh run for minutes or fill the memory: many parts, and accessors without data;
+    and SceneError for what it leaves out: compression, instances, sparse positions and fans of triangles.
     """
-    content = path.read_bytes()
-    json_length, _ = struct.unpack_from("<II", content, 12)
-    tree = parse_json_object(content[20 : 20 + json_length].decode())
+    tree, content = _read_glb(path)
+    _check_readable(tree, path)
     accessors = tree.get("accessors", [])
     for accessor in accessors:
         if "bufferView" not in accessor and accessor["count"] > max_expanded_bytes(len(content)) // 64:  # 4 x 4 numbers
@@ -159,17 +165,116 @@ def _glb_textures(path: Path) -> Iterator[Path | bytes]:
         n_corners += accessors[part.get("indices", part["attributes"]["POSITION"])]["count"]
     if n_corners > fitting(200):  # bytes of a corner while it is read
         raise ValueError(f"its nodes have {n_corners // 3:,} triangles together")
-    buffers = [content[28 + json_length :]]
-    for buffer in tree.get("buffers", []):
-        source = _at_uri(buffer["uri"], path) if "uri" in buffer else buffers[0]
-        buffers.append(source.read_bytes() if isinstance(source, Path) else source)
+    buffers = _buffers(tree, content, path)
     for image in tree.get("images", []):
         if "bufferView" in image:
             view = tree["bufferViews"][image["bufferView"]]
             start = view.get("byteOffset", 0)
-            yield buffers[1 + view["buffer"]][start : start + view["byteLength"]]
+            yield buffers[view["buffer"]][start : start + view["byteLength"]]
         else:
             yield _at_uri(image["uri"], path)
+
+
+def _read_glb(path: Path) -> tuple[dict[str, Any], bytes]:
+    """The JSON object of a binary glTF file, and its own buffer."""
+    content = path.read_bytes()
+    json_length, _ = struct.unpack_from("<II", content, 12)
+    return parse_json_object(content[20 : 20 + json_length].decode()), content[28 + json_length :]
+
+
+def _buffers(tree: dict[str, Any], content: bytes, path: Path) -> list[bytes]:
+    sources = [_at_uri(one["uri"], path) if "uri" in one else content for one in tree.get("buffers", [])]
+    return [source.read_bytes() if isinstance(source, Path) else source for source in sources]
+
+
+def _check_readable(tree: dict[str, Any], path: Path) -> None:
+    """Raise SceneError if geometry of a glTF file is stored in a way that is not read."""
+    primitives = [primitive for mesh in tree.get("meshes", []) for primitive in mesh["primitives"]]
+    positions = [tree["accessors"][primitive["attributes"]["POSITION"]] for primitive in primitives]
+    # materials and textures may change how a mesh appears, but not where it is
+    unread = {
+        name for name in tree.get("extensionsRequired", []) if not re.match("KHR_(mat|tex|lig|mesh_q)|EXT_tex", name)
+    }
+    unread |= {"EXT_mesh_gpu_instancing"} & {*tree.get("extensionsUsed", [])}
+    if any("bufferView" not in position or "sparse" in position for position in positions):
+        unread |= {name for primitive in primitives for name in primitive.get("extensions", {})} or {"sparse accessors"}
+    if any(primitive.get("mode") == 6 for primitive in primitives):
+        unread.add("triangle fans")
+    if unread:
+        fix = "Export it from Blender as GLB without compression and instances, or as PLY."
+        problem = "the mesh is compressed, or stored in another way that is not read"
+        raise SceneError(problem, path=path, value=", ".join(sorted(unread)), fix=fix)
+
+
+def _with_float_positions(path: Path) -> str | io.BytesIO:
+    """The file, or its content with float numbers for normalized integers (glTF 2.0, 3.6.2.2), which trimesh ignores.
+
+    Colours stay integers, as trimesh expects.
+    """
+    tree, content = _read_glb(path)
+    primitives = [primitive for mesh in tree.get("meshes", []) for primitive in mesh["primitives"]]
+    used = {at for primitive in primitives for name, at in primitive["attributes"].items() if name[:5] != "COLOR"}
+    normalized = [tree["accessors"][at] for at in sorted(used) if tree["accessors"][at].get("normalized")]
+    if not normalized:
+        return str(path)
+    buffers = _buffers(tree, content, path)
+    tree["buffers"].append({})
+    decoded = b""
+    for accessor in normalized:
+        view = tree["bufferViews"][accessor["bufferView"]]
+        kind = np.dtype({5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2"}[accessor["componentType"]])
+        shape = accessor["count"], {"VEC2": 2, "VEC3": 3, "VEC4": 4}[accessor["type"]]
+        strides = view.get("byteStride", shape[1] * kind.itemsize), kind.itemsize
+        start = view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
+        stored = np.ndarray(shape, kind, buffers[view["buffer"]], start, strides)
+        values = np.maximum(stored / np.float32(np.iinfo(kind).max), -1).astype("<f4").tobytes()
+        accessor |= {
+            "bufferView": len(tree["bufferViews"]),
+            "byteOffset": 0,
+            "componentType": 5126,
+            "normalized": False,
+        }
+        tree["bufferViews"].append({"buffer": len(buffers), "byteOffset": len(decoded), "byteLength": len(values)})
+        decoded += values
+    tree["buffers"][-1] = {
+        "byteLength": len(decoded),
+        "uri": f"data:application/octet-stream;base64,{base64.b64encode(decoded).decode()}",
+    }
+    chunk = json.dumps(tree).encode()
+    chunk += b" " * (-len(chunk) % 4)
+    own = struct.pack("<I4s", len(content), b"BIN\0") + content if content else b""
+    header = struct.pack("<4sIII4s", b"glTF", 2, 20 + len(chunk) + len(own), len(chunk), b"JSON")
+    return io.BytesIO(header + chunk + own)
+
+
+def _with_positive_indices(path: Path) -> str | io.StringIO:
+    """The OBJ file, or its text with indices from the start of the file for those from the line, which trimesh ignores.
+
+    Raises ValueError for an index before the first element.
+    """
+    with path.open(encoding="utf-8", errors="replace") as file:
+        if not any(line.startswith("f") and "-" in line for line in file):
+            return str(path)
+    counts = dict.fromkeys(("v", "vt", "vn"), 0)
+    lines = []
+    for line in path.read_text(encoding="utf-8", errors="replace").replace("\\\n", " ").splitlines():
+        words = line.split()
+        if words and words[0] in counts:
+            counts[words[0]] += 1
+        elif words and words[0] == "f" and "-" in line:
+            corners = [word.split("/") for word in words[1:]]
+            line = " ".join(["f", *("/".join(map(_positive, corner, counts.values())) for corner in corners)])
+        lines.append(line)
+    return io.StringIO("\n".join(lines) + "\n")
+
+
+def _positive(index: str, count: int) -> str:
+    """An OBJ index from 1, of one that may count back from the last of `count` elements; "" stays."""
+    if not index.startswith("-"):
+        return index
+    if count + int(index) < 0:
+        raise ValueError(f"index {index} after {count} elements")
+    return str(count + 1 + int(index))
 
 
 def _at_uri(uri: str, path: Path) -> Path | bytes:

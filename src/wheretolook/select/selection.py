@@ -185,7 +185,9 @@ def reported(scorer: Scorer, waypoints: Waypoints, rows: NDArray[np.int64], pose
     """Return the scorer's report of poses (V, 3, 4) in the world, at the waypoints of rows (V,), each of rank 1."""
     step = _views_at_once(scorer) * max(1, len(rows) // max(1, len(waypoints)))
     views = Views.concatenate(scorer.report(poses[begin : begin + step]) for begin in range(0, len(poses), step))
-    return replace(views, waypoint=rows, waypoint_id=tuple(waypoints.ids[row] for row in rows), rank=np.ones_like(rows))
+    ids = tuple(waypoints.ids[row] for row in rows)
+    read_as = (waypoints.read_as,) * len(rows) if waypoints.read_as else None
+    return replace(views, waypoint=rows, waypoint_id=ids, read_as=read_as, rank=np.ones_like(rows))
 
 
 def explained(reasons: ReasonCounter, views: Views) -> Views:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from math import inf
 from numbers import Integral
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,8 +15,8 @@ from numpy.typing import ArrayLike, NDArray
 from wheretolook.geometry.lattices import VoxelGrid
 from wheretolook.geometry.pose_files import (
     QUATERNION_COLUMNS,
-    TRANSLATION_COLUMNS,
     holds_cam_from_world,
+    locations_of_rows,
     poses_of_rows,
     read_named_rows,
 )
@@ -45,6 +46,8 @@ class Waypoints:
     path: Path | None = None  # the file
     # The robot's heading: (W, 1) yaws in degrees in the upright map, or (W, 4) quaternions wxyz, map_from_robot.
     headings: Float | None = None
+    read_as: str = ""  # format of the file
+    of_base: bool | None = None  # whether quaternions are of a robot's base, not of a camera; None as `is_of_base`
 
     def __len__(self) -> int:
         return len(self.points)
@@ -54,19 +57,21 @@ class Waypoints:
         kept = np.arange(len(self))[rows]
         lines = tuple(self.lines[row] for row in kept) if self.lines else ()
         headings = None if self.headings is None else self.headings[kept]
-        return Waypoints(self.points[kept], tuple(self.ids[row] for row in kept), lines, self.path, headings)
+        ids = tuple(self.ids[row] for row in kept)
+        return replace(self, points=self.points[kept], ids=ids, lines=lines, headings=headings)
 
     def heading_deg(self, world_from_map: Float) -> Float:
         """Return the robot's yaw in degrees at each waypoint, (W,), in the world, by the rotation (3, 3) to it.
 
-        A quaternion is that of a camera, which looks along z, or of a robot whose z is up, which heads along x. Raises
-        a TableError if a heading is unknown.
+        A quaternion is that of a camera, which looks along z, or of a robot's base, which heads along x: see `of_base`.
+        Raises a TableError if a heading is unknown.
         """
         yaw = np.full(len(self), np.nan) if self.headings is None else self.headings[:, 0]
         if self.headings is not None and self.headings.shape[1] == 4:
             is_known = np.linalg.norm(self.headings, axis=1) > 0
             axes = world_from_map @ rotation_from_quaternion(self.headings + ~is_known[:, None])
-            forward = np.where(axes[:, 2, 2:] > 0.7, axes[..., 0], axes[..., 2])
+            is_base = (axes[is_known, 2, 2] > np.sqrt(0.5)).all() if self.of_base is None else self.of_base
+            forward = axes[..., 0] if is_base else axes[..., 2]
             yaw = np.where(is_known, np.degrees(pan_tilt_angles(forward)[0]), np.nan)
         for row in np.flatnonzero(~np.isfinite(yaw)).tolist():
             fix = "Give a TUM trajectory or a CSV with heading_deg or qw, qx, qy, qz, in Python heading_deg; or leave pan out."
@@ -80,7 +85,7 @@ class Waypoints:
 
     def label(self, row: int) -> str:
         """Return the line of a waypoint, or its name."""
-        return f"line {self.lines[row]}" if self.lines else f"waypoint {self.ids[row]}"
+        return f"line {self.lines[row]}" if self.lines and self.lines[row] else f"waypoint {self.ids[row]}"
 
     @classmethod
     def of(
@@ -112,27 +117,31 @@ class Waypoints:
         return self
 
 
-def read_waypoints(path: str | Path) -> Waypoints:
-    """Read a file in one of `geometry.pose_files.FORMATS`, detected from its columns.
+def read_waypoints(path: str | Path, frame: str | None = None) -> Waypoints:
+    """Read a file in one of `geometry.pose_files.FORMATS`, recognized by its content.
 
-    Raises a TableError, with the line, if the file is missing, empty, has other columns, or a value is not a number.
+    `frame` states whose orientations it holds, "base" or "camera"; None as `is_of_base`. Raises a TableError, with the
+    line, if the file is missing, empty, has other columns, or a value is not a number.
     """
     table = read_named_rows(path)
-    columns = table.columns
-    points = table.numbers(TRANSLATION_COLUMNS if "x" not in columns and "tx" in columns else "xyz")
+    points = locations_of_rows(table)
     kinds = (("heading_deg",), ("yaw_deg",), QUATERNION_COLUMNS)
-    known = next((table.numbers(kind) for kind in kinds if {*kind} <= {*columns}), None)
-    if "x" not in columns and holds_cam_from_world(table):
-        poses = poses_of_rows(table)
-        points = camera_centers(poses)
-        if known is not None and known.shape[1] == 4:
-            known = quaternion_from_rotation(np.swapaxes(poses[:, :, :3], 1, 2))
-    return Waypoints(points, table.names, tuple(number for number, _ in table.rows), table.path, known)
+    known = next((table.numbers(kind) for kind in kinds if {*kind} <= {*table.columns}), None)
+    if known is not None and known.shape[1] == 4 and holds_cam_from_world(table):
+        known = quaternion_from_rotation(np.swapaxes(poses_of_rows(table)[:, :, :3], 1, 2))
+    of_base = frame == "base" if frame or table.of_cameras else None
+    lines = tuple(number for number, _ in table.rows)
+    return Waypoints(points, table.names, lines, table.path, known, table.format, of_base)
 
 
 def parse_points(texts: Sequence[str]) -> Waypoints:
     """Parse texts "x,y,z". Raises TableError if one is not three numbers."""
-    return Waypoints.of([text.split(",") for text in texts])
+    parts = [text.split(",") for text in texts]
+    if len(texts) > 1 and any(len(part) != 3 or not all(part) for part in parts):
+        joined = ",".join(filter(None, ",".join(texts).split(",")[:6]))
+        fix = f"Write {','.join(joined.split(',')[:3])} without blanks; blanks separate waypoints."
+        raise TableError("the coordinates of a waypoint are separated by commas", value=" ".join(texts)[:80], fix=fix)
+    return Waypoints.of(parts)
 
 
 def grid_waypoints(localization_map: LocalizationMap, space: Any, spacing_m: float) -> Waypoints:
@@ -239,8 +248,13 @@ class SelectionRequest:
         joint = self.looks is not None
         in_order = self.max_turn_deg is not None
         stopping = self.least_score is not None
-        for name in ("max_turn_deg", "max_total_turn_deg", "sigma_m", "yaw_sigma_deg"):
-            check_range(name, getattr(self, name) or 0, 0)
+        for name, high in (
+            ("max_turn_deg", inf),
+            ("max_total_turn_deg", inf),
+            ("sigma_m", 1e4),
+            ("yaw_sigma_deg", 360),
+        ):
+            check_range(name, getattr(self, name) or 0, 0, high)  # draws beyond any map
         reject(
             (self.apart_deg is not None and self.n == 1, "apart_deg needs an n of at least 2", self.apart_deg),
             (not 0 <= (self.apart_deg or 0) <= 180, "apart_deg must be 0 to 180", self.apart_deg),

@@ -28,9 +28,9 @@ from wheretolook.scorers.registry import make_scorer
 from wheretolook.scorers.weights import load_scorer, resolve_weights
 from wheretolook.select.selection import explained, reported, select_views
 from wheretolook.select.waypoints import SelectionRequest, Waypoints, grid_waypoints, usable_waypoints
-from wheretolook.space.free_space import MappedSpace
+from wheretolook.space.mapped_space import MappedSpace
 from wheretolook.utils.devices import usable_device
-from wheretolook.utils.errors import ConfigError, PlanningError
+from wheretolook.utils.errors import ConfigError, PlanningError, check_names
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -70,6 +70,7 @@ class WhereToLook:
         camera: Camera | str | int | None = None,
         fov_deg: float | None = None,
         mesh: str | Path | None = None,
+        mesh_up: str = "z",
         depth: str | Path | None = None,
         depth_scale: float = 1000.0,
         occlusion: str | None = None,
@@ -93,6 +94,7 @@ class WhereToLook:
                 camera_id of one of the model. None for the model's own.
             fov_deg: instead, a pinhole of that horizontal field of view in degrees, of 640 x 480 px.
             mesh: mesh of the scene in the map's frame, for true occlusion.
+            mesh_up: which axis of the mesh's file is the map's z: "x", "y" or "z", with "-" if it points down.
             depth: folder of depth images of the model's images, for occlusion by the surface they fuse to.
             depth_scale: units of integer depth images in a metre.
             occlusion: "mesh", "tsdf" (depth images), "hidden-points" (from the landmarks alone) or "none" (landmarks
@@ -113,10 +115,11 @@ class WhereToLook:
         device = usable_device(device)
         camera = _described_camera(camera, fov_deg)
         axes = direction_lattice(directions, lattice)
+        check_names("option of the frame", frame, FrameOptions)
         resolve_weights(method, weights)  # so that missing ones are reported before anything is read
         mesh, depth, database = (None if file is None else Path(file) for file in (mesh, depth, database))
         options = FrameOptions(**frame)
-        files = ColmapFiles(Path(path), mesh, depth, depth_scale, database, max_reprojection_error_px, options)
+        files = ColmapFiles(Path(path), mesh, depth, depth_scale, database, max_reprojection_error_px, options, mesh_up)
         scene = Scene.of_colmap(files, camera, occlusion, SceneConfig(occlusion_cache_bytes=1 << 30), device)
         here = scene.localization_map
         weights = resolve_weights(method, weights, here.landmarks.features)
@@ -267,6 +270,7 @@ class WhereToLook:
             look = self.at_accuracy(accuracy)
             return look.best(points, n, ids=ids, heading_deg=heading_deg, progress=progress, **options)
         waypoints = Waypoints.of(points, ids, heading_deg)
+        check_names("option of best", options, SelectionRequest, ("ids", "heading_deg", "progress", "accuracy"))
         request = SelectionRequest(n=n, **options)
         return select_views(self.scorer, self.reasons, self.directions, waypoints, request, progress)
 

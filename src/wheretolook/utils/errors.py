@@ -160,6 +160,15 @@ def check_choice(name: str, value: object, choices: Iterable[object]) -> None:
         raise ConfigError(f"unknown {name}", value=value, fix=f"Use one of {', '.join(map(str, known))}.")
 
 
+def check_names(what: str, names: Iterable[str], settings: Any, others: Iterable[str] = ()) -> None:
+    """Raise ConfigError, with the nearest known name, unless all names are fields of a dataclass or others."""
+    known = [*(field.name for field in dataclasses.fields(settings)), *others]
+    for name in names:
+        if name not in known:
+            fix = did_you_mean(name, known) or f"Use {', '.join(known)}."
+            raise ConfigError(f"unknown {what}", value=name, fix=fix)
+
+
 def reject(*cases: tuple[bool, str, object]) -> None:
     """Raise ConfigError with the problem and the value of the first case that holds."""
     for holds, problem, value in cases:

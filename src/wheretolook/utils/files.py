@@ -59,6 +59,8 @@ def copy_file(source: Path, target: Path) -> None:
 
 def check_output(path: Path, inputs: Iterable[Path] = ()) -> None:
     """Raise ConfigError for an output that is a device, pipe, link to a file, an input or its map, or in a dataset."""
+    if "\0" in str(path):
+        raise ConfigError("a path has no NUL", value=str(path))
     target = Path(os.path.realpath(path))
     of_map = target.stem in ("cameras", "images", "points3D", "rigs", "frames", "landmarks")
     replaced = {target, target.parent if of_map else target}
@@ -84,7 +86,7 @@ def atomic_write(path: Path, partial: Path | None = None) -> Iterator[Path]:
     it cannot be written.
     """
     partial = partial or path.with_name(path.name + ".partial")
-    if path.exists() and not path.is_file() and not path.is_dir():  # a device or pipe
+    if "\0" in str(path) or (path.exists() and not path.is_file() and not path.is_dir()):  # a device or pipe
         check_output(path)
     try:
         with storage_errors(path, partial):
@@ -255,13 +257,23 @@ def read_text(path: Path, at_most: int = MAX_TEXT_BYTES, pipes: bool = False) ->
 
 
 def parse_json(text: str) -> Any:
-    """Parse a JSON text. Raises ValueError if it is none, has too many values, or nests them too deeply."""
+    """Parse a JSON text. Raises ValueError if it is none, gives a key twice, has too many values or nests them too deeply."""
     if sum(map(text.count, ",[{")) > 1_500_000:  # an empty list takes three bytes of a file and eighty of memory
         raise ValueError("it has more than 1,500,000 values")
     try:
-        return json.loads(text)
+        return json.loads(text, object_pairs_hook=_unique)
     except RecursionError as error:
         raise ValueError("its values are nested too deeply") from error
+
+
+def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Return pairs as a dictionary. Raises ValueError for a key that is given twice: the first value would be ignored."""
+    result: dict[str, Any] = {}
+    for name, value in pairs:
+        if name in result:
+            raise ValueError(f"the key {name!r} is given twice")
+        result[name] = value
+    return result
 
 
 def parse_json_object(text: str) -> dict[str, Any]:

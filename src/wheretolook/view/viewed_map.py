@@ -22,7 +22,7 @@ from wheretolook.geometry.poses import Float, camera_centers
 from wheretolook.geometry.views import Views
 from wheretolook.mapping.config import FrameOptions, place_name
 from wheretolook.mapping.landmarks import Landmarks
-from wheretolook.mapping.map_frame import IDENTITY, mesh_warning, warn_of_mesh
+from wheretolook.mapping.map_frame import IDENTITY, mesh_warning
 from wheretolook.scorers.registry import check_method, make_scorer, scorers
 from wheretolook.scorers.weights import resolve_weights, weights_by_method
 from wheretolook.utils.errors import MapError, TableError, WhereToLookError
@@ -358,6 +358,7 @@ def open_map(
     device: str = "cpu",
     data: Path = Path("data"),
     frame: FrameOptions = FrameOptions(),
+    mesh_up: str = "z",
 ) -> ViewedMap:
     """Open a COLMAP model and a mesh in its frame.
 
@@ -369,12 +370,12 @@ def open_map(
         ConfigError: there is no such camera.
         WeightsError: the weights cannot be used.
     """
-    scene = Scene.of_colmap(ColmapFiles(path, mesh, frame=frame), camera, config=CONFIG, device=device)
+    scene = Scene.of_colmap(ColmapFiles(path, mesh, frame=frame, mesh_up=mesh_up), camera, config=CONFIG, device=device)
     landmarks = scene.landmarks
     if len(landmarks) == 0:
         raise MapError("the map has no landmarks", path=path, fix="Map it again.")
     if mesh is not None:
-        warn_of_mesh(mesh, landmarks.points, scene.raycaster)
+        _ = scene.mesh_space  # raises or warns before the page is served
     own = {"given": or_shipped(weights)} if weights else map_weights(path, data, landmarks)
     return ViewedMap(scene.name, scene, own)
 

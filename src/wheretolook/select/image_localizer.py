@@ -241,7 +241,7 @@ class ImageLocalizer:
             if near is not None:
                 max_ratio = self._localizer.config.max_ratio if self._localizer.kind.in_bytes else None
                 allowed = near.allows(self.landmarks.points, self.landmarks.mapping_distance_m, query.camera)
-                matches = matches_among(found[0], allowed, max_ratio)
+                matches = matches_among(found[0], allowed, max_ratio, self._localizer.twins)
                 of_prior.append(Look.of(keypoints.pixels, matches, query.camera, pose, query.focal))
         ratio = rig.focal_ratio([first for first, *_ in views])
         views = [[look.scaled(ratio) for look in of_image] for of_image in views]

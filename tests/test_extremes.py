@@ -22,7 +22,7 @@ from wheretolook.planning.config import ViewpointMapConfig
 from wheretolook.planning.scene_map import build_viewpoint_map
 from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.scorers.registry import make_scorer, scorers
-from wheretolook.space.free_space import MappedSpace
+from wheretolook.space.mapped_space import MappedSpace
 from wheretolook.utils import devices as memory
 from wheretolook.utils.errors import ConfigError, SceneError
 from wheretolook.visibility.counting import SurveyOptions, survey
@@ -67,7 +67,7 @@ def test_flat_and_tiny_maps_are_scored_by_every_method(name):
         free = hides.unoccluded(np.zeros((1, 3)), landmarks.points)[0]
         np.testing.assert_array_equal(seen, [np.sum(expected & free), 0])
         assert seen[0] > 0
-        rules = [rule for rule, method in scorers().items() if method.learn is None and not method.weights]
+        rules = [rule for rule, method in scorers().items() if method.learner is None and not method.weights]
         for method in (*rules, *WEIGHTS_OF):
             score = scores_of(method, localization_map, poses)
             assert score.shape == (2,) and not np.isnan(score).any(), (method, score)

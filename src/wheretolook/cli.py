@@ -17,7 +17,7 @@ from functools import cache
 from importlib.metadata import entry_points
 from pathlib import Path
 from pkgutil import resolve_name
-from typing import Any, get_type_hints
+from typing import Any, get_args, get_type_hints
 
 from wheretolook.utils.errors import ConfigError, WhereToLookError, did_you_mean
 from wheretolook.utils.files import MAX_PIXELS, read_yaml
@@ -255,6 +255,8 @@ def parse_command(name: str, arguments: Sequence[str]) -> Any:
     values: dict[str, Any] = {}
     for settings in (*(read_settings(or_shipped(file), command, options) for file in files), given):
         for option, value in settings.items():
+            if value is None and type(None) not in (options[option], *get_args(options[option])):
+                raise ConfigError("this option needs a value", path=", ".join(files), value=option)
             former = values.get(option)
             values[option] = {**former, **value} if isinstance(former, dict) and isinstance(value, dict) else value
     parser = build_parser(name)

@@ -76,11 +76,11 @@ def test_mutual_nearest_neighbours_are_those_of_all_products(n, monkeypatch):
         assert n // 4 < len(rows) <= n // 2  # of twins, the nearer
 
 
-def untrained(method, folder):
+def untrained(method, folder, seed=0):
     """A file of weights as the authors of a network give theirs, but with random numbers."""
     torch = pytest.importorskip("torch")
     kornia = pytest.importorskip("kornia.feature", reason="learned features need kornia: pip install kornia")
-    torch.manual_seed(0)
+    torch.manual_seed(seed)
     if method == "aliked":
         state = {
             name: value for name, value in kornia.ALIKED("aliked-n16rot").state_dict().items() if "dkd" not in name

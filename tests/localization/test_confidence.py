@@ -32,6 +32,8 @@ def test_a_coarser_accuracy_is_more_probable_up_to_the_right_place():
     assert found == sorted(found) and found[0] < 0.5 < found[1]
     assert model.of(pose(200, 0.02), (1e6, 180.0)) == pytest.approx(found[-1], abs=1e-6)
     assert model.of(pose(5, 0.02)) == 0
+    few, enough = (model.of(pose(n, 0.001), (1e6, 180.0)) for n in (11, 12))
+    assert few <= 0.5 < enough
 
 
 def test_poses_that_exclude_each_other_have_probabilities_up_to_one_together():

@@ -188,7 +188,7 @@ def test_scale_and_axes_are_doubted_where_they_are_implausible():
     for distance_m in (0.5, 2.5, 30.0):
         assert scale_warning(np.full(100, distance_m), centers) == ""
     assert scale_warning(np.full(100, 37 * 2.5), 37 * centers) and scale_warning(np.full(100, 2.5 / 37), centers / 37)
-    assert scale_warning(np.full(100, 20.0), 50 * centers)  # cameras metres apart
+    assert scale_warning(np.full(100, 20.0), 110 * centers)  # cameras metres apart
     assert scale_warning(np.full(100, 2.5), centers[:1]) == ""  # one camera has no distance from others
     assert up_axis_warning(poses) == ""
     for turn in ([[1, 0, 0], [0, 0, -1], [0, 1, 0]], np.diag([1, -1, -1])):

@@ -11,6 +11,7 @@ from synthetic_dataset import make_landmarks
 from wheretolook.dataset.layout import Dataset, SceneFolder
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.lattices import VoxelGrid, direction_lattice
+from wheretolook.geometry.similarity import Similarity
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.map import Map
 from wheretolook.planning.scene_map import build_viewpoint_map
@@ -25,6 +26,8 @@ from wheretolook.visibility.occlusion import MeshOcclusion
 CAMERA = PinholeCamera(160, 120, 80.0)
 GRID = VoxelGrid((0.0, 0.0, 0.0), ROOM, (5, 4, 3))
 DIRECTIONS = direction_lattice(60)
+TURNED = Similarity(0.1, np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]), np.array([0.3, -0.2, 0.1]))
+"""World from a map with y down, of 0.1 m units."""
 
 
 T = TypeVar("T")

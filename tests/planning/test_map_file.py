@@ -1,6 +1,7 @@
 """Saved viewpoint maps: round trips, foreign readers, and what is damaged."""
 
 import json
+import os
 import shutil
 import subprocess
 from dataclasses import replace
@@ -8,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from planning.rooms import GRID, build, room_landmarks
+from planning.rooms import GRID, TURNED, build, room_landmarks
 from wheretolook.planning.scene_map import shares_below
 from wheretolook.planning.viewpoint_map import ARRAYS, DESCRIPTION, LAYOUT, ViewpointMap
 from wheretolook.utils.errors import MapFormatError
@@ -37,6 +38,7 @@ def test_what_was_saved_comes_back(viewpoint_map, folder, mmap):
         assert getattr(loaded, name).dtype == np.dtype(kind)
         assert getattr(loaded, name).flags.writeable != mmap
     assert (loaded.grid, loaded.origin) == (viewpoint_map.grid, viewpoint_map.origin)
+    assert loaded.world_from_map.record() == viewpoint_map.world_from_map.record()
     loaded.save(folder.with_name("again"))
     assert content_of(folder.with_name("again")) == content_of(folder)
 
@@ -53,10 +55,14 @@ def test_a_map_can_replace_one_whose_files_are_mapped(folder):
 
 @pytest.mark.skipif(shutil.which("g++") is None, reason="needs a C++ compiler")
 def test_the_layouts_example_compiles_and_agrees(viewpoint_map, folder):
+    viewpoint_map = viewpoint_map.in_frame(TURNED)
+    viewpoint_map.save(folder)
     text = (folder / LAYOUT).read_text().split("IN C++")[1].split("\n\n", 1)[1].split("\n\nLANDMARKS")[0]
     template, body = text.split("  int64_t voxel = 0;", 1)
     about = json.loads((folder / DESCRIPTION).read_text())
     lower, upper, shape = (", ".join(map(str, about["grid"][name])) for name in ("lower", "upper", "shape"))
+    scale, turn, shift = about["frame"].values()
+    rotation = ", ".join(f"{{{', '.join(map(str, row))}}}" for row in turn)
     program = f"""#include <algorithm>
 #include <cstdint>
 #include <cstdio>
@@ -68,7 +74,8 @@ std::string file(const std::string& name) {{
   std::ifstream in("{folder}/" + name, std::ios::binary);
   return std::string(std::istreambuf_iterator<char>(in), {{}});
 }}
-const double lower[] = {{{lower}}}, upper[] = {{{upper}}};
+const double lower[] = {{{lower}}}, upper[] = {{{upper}}}, scale = {scale};
+const double rotation[][3] = {{{rotation}}}, translation[] = {{{", ".join(map(str, shift))}}};
 const int64_t shape[] = {{{shape}}}, D = {about["sizes"]["D"]};
 const std::string rows = file("row_of_voxel.npy"), ranks = file("ranked.npy");
 const char *row_of_voxel_npy = rows.data(), *ranked_npy = ranks.data();
@@ -84,6 +91,7 @@ int main() {{
     source.write_text(program)
     subprocess.run(["g++", "-std=c++17", "-o", str(source.with_suffix("")), str(source)], check=True)
     points = np.random.default_rng(0).uniform(np.array(GRID.lower) - 0.3, np.array(GRID.upper) + 0.3, (500, 3))
+    points = TURNED.inverse.apply(points)
     lines = "\n".join(" ".join(map(repr, point)) for point in points.tolist())
     found = subprocess.run([str(source.with_suffix(""))], input=lines, capture_output=True, text=True, check=True)
     np.testing.assert_array_equal([*map(int, found.stdout.split())], viewpoint_map.best_many(points).direction_id)
@@ -92,7 +100,7 @@ int main() {{
 @pytest.mark.parametrize(
     "change",
     [
-        {"version": 2}, {"format": "else"}, {"sizes": {"V": 60, "L": 1, "D": 60, "N": 200}}, {"sizes": {}},
+        {"version": 1}, {"format": "else"}, {"sizes": {"V": 60, "L": 1, "D": 60, "N": 200}}, {"sizes": {}},
         {"grid": {"lower": [0, 0, 0], "upper": [1, 1, 1], "shape": [1, 1, 1]}}, {"origin": {"scorer": "bins"}},
     ],
 )  # fmt: skip
@@ -102,6 +110,25 @@ def test_damaged_descriptions(folder, change):
     for mmap in (False, True):
         with pytest.raises(MapFormatError):
             ViewpointMap.load(folder, mmap)
+
+
+def test_a_grid_that_was_moved_is_noticed(folder):
+    path = folder / DESCRIPTION
+    content = json.loads(path.read_text())
+    content["grid"]["lower"][0] += 0.5
+    content["grid"]["upper"][0] += 0.5
+    path.write_text(json.dumps(content))
+    for mmap in (False, True):
+        with pytest.raises(MapFormatError, match="changed"):
+            ViewpointMap.load(folder, mmap)
+
+
+@pytest.mark.parametrize("mmap", [False, True])
+def test_a_pipe_in_place_of_an_array(folder, mmap):
+    (folder / "scores.npy").unlink()
+    os.mkfifo(folder / "scores.npy")
+    with pytest.raises(MapFormatError):
+        ViewpointMap.load(folder, mmap)
 
 
 @pytest.mark.parametrize("name", ["row_of_voxel.npy", "scores.npy", DESCRIPTION])

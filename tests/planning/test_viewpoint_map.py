@@ -3,8 +3,11 @@
 import numpy as np
 import pytest
 
-from planning.rooms import DIRECTIONS, GRID, build, free_voxels, room_landmarks, room_map
+from planning.rooms import CAMERA, DIRECTIONS, GRID, TURNED, build, free_voxels, occlusion, room_landmarks, room_map
 from wheretolook.geometry.poses import poses_looking_along, rotation_angle_deg, rotation_looking_along
+from wheretolook.inputs.localization_map import LocalizationMap
+from wheretolook.mapping.map import Map
+from wheretolook.mapping.map_frame import MapFrame
 from wheretolook.planning.scene_map import build_viewpoint_map
 from wheretolook.scorers.registry import make_scorer
 from wheretolook.utils.errors import ConfigError, SceneError
@@ -85,6 +88,40 @@ def test_queries_equal_brute_force(viewpoint_map):
         near = rotation_angle_deg(turn, rotation_looking_along(DIRECTIONS)) <= limit
         for start in (axis, turn):
             assert id_of(viewpoint_map.best_reachable(point, start, limit)) == best_by_hand(viewpoint_map, row, near)
+
+
+def test_a_map_of_a_turned_model_answers_in_its_frame(viewpoint_map):
+    landmarks = room_landmarks(400)
+    there = LocalizationMap(Map(landmarks, frame=MapFrame(TURNED)), CAMERA, occlusion())
+    turned = build_viewpoint_map(make_scorer("bins", there), GRID, free_voxels(), DIRECTIONS, "fibonacci")
+    for number, point in enumerate(points_about(40, seed=3)):
+        at = TURNED.inverse.apply(point)
+        expected = viewpoint_map.best(point)
+        best = turned.best(at)
+        assert id_of(best) == id_of(expected) and turned.rows([at])[0] == viewpoint_map.row(point)
+        if best is None:
+            continue
+        np.testing.assert_allclose(TURNED.rotation @ best.axis, expected.axis, atol=1e-12)
+        np.testing.assert_allclose(turned.interpolated(at), viewpoint_map.interpolated(point), atol=1e-9)
+        many = turned.best_many([at])
+        np.testing.assert_allclose(many.positions, [at], atol=1e-9)
+        np.testing.assert_allclose(many.axes, [best.axis], atol=1e-12)
+        in_world = viewpoint_map.best_many([point]).cam_from_world[0, :, :3]
+        np.testing.assert_allclose(many.cam_from_world[0, :, :3], in_world @ TURNED.rotation, atol=1e-12)
+        axis = TURNED.rotation.T @ AXIS
+        start = rotation_looking_along(AXIS) @ TURNED.rotation
+        for name, own, world in (
+            ("best_in_cone", axis, AXIS),
+            ("best_reachable", axis, AXIS),
+            ("best_reachable", start, AXIS),
+        ):
+            found, expected = getattr(turned, name)(at, own, 40.0), getattr(viewpoint_map, name)(point, world, 40.0)
+            assert id_of(found) == id_of(expected)
+        if number < 3:
+            looks = turned.best_looks(at, 2, 100.0, scorer=make_scorer("bins", there), start=axis)
+            expected = viewpoint_map.best_looks(point, 2, 100.0, scorer=make_scorer("bins", there), start=AXIS)
+            assert [*map(id_of, looks)] == [*map(id_of, expected)]
+    np.testing.assert_allclose(TURNED.apply(turned.locations), viewpoint_map.locations, atol=1e-9)
 
 
 def test_interpolation_lies_between_free_neighbours_and_is_trilinear(viewpoint_map):

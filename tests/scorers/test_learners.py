@@ -133,7 +133,7 @@ def warnings_of(scorer, cam_from_world):
     return [str(one.message) for one in caught]
 
 
-@pytest.mark.parametrize("name", {"set", "trees", "expected-inliers"} & {*scorers()})
+@pytest.mark.parametrize("name", sorted({"set", "trees", "expected-inliers"} & {*scorers()}))
 def test_views_outside_the_training_range_warn_once(dataset, trained, name):
     weights = trained[scorers()[name].weights].path
     scene = dataset.split("train")[0]

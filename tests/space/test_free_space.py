@@ -12,7 +12,8 @@ from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.geometry.tsdf import DepthImage, TsdfConfig, TsdfVolume
 from wheretolook.rendering.raycasting import MeshRaycaster
 from wheretolook.space.config import FreeSpaceConfig, MappedSpaceConfig
-from wheretolook.space.free_space import FreeSpace, MappedSpace, TsdfSpace, seen_through
+from wheretolook.space.free_space import FreeSpace, TsdfSpace, seen_through
+from wheretolook.space.mapped_space import MappedSpace
 from wheretolook.utils.errors import ConfigError, MapError
 
 

@@ -305,7 +305,7 @@ def _import_model(options: BuildMap, log: Log) -> tuple[SceneFolder, Dataset]:
         save_glb(loaded, scene.mesh)
     cache.store()
     removed = f", {report.n_landmarks_removed:,} points removed" if report.n_landmarks_removed else ""
-    again = ", triangulated again," if report.triangulated_anew else ""
+    again = ", triangulated again," if report.retriangulated else ""
     log(f"{scene.name}: {report.n_landmarks:,} landmarks{again} from {report.n_images} images{removed} -> {scene.map}")
     return scene, dataset
 

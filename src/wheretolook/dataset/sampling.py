@@ -15,7 +15,8 @@ from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.lattices import VoxelGrid
 from wheretolook.geometry.poses import Float, camera_centers, poses_looking_along, rotation_looking_along
 from wheretolook.mapping.landmarks import Landmarks
-from wheretolook.space.free_space import FreeSpace, MappedSpace
+from wheretolook.space.free_space import FreeSpace
+from wheretolook.space.mapped_space import MappedSpace
 from wheretolook.utils.devices import fitting
 from wheretolook.utils.errors import ConfigError, SceneError
 from wheretolook.visibility.counting import Survey, SurveyOptions, survey

@@ -32,7 +32,8 @@ if TYPE_CHECKING:  # pandas, torch and Warp are imported when first needed
     from wheretolook.inputs.localization_map import LocalizationMap
     from wheretolook.rendering.raycasting import MeshRaycaster
     from wheretolook.rendering.warp_renderer import Renderer
-    from wheretolook.space.free_space import FreeSpace, MappedSpace
+    from wheretolook.space.free_space import FreeSpace
+    from wheretolook.space.mapped_space import MappedSpace
     from wheretolook.visibility.occlusion import OcclusionModel
 
 
@@ -257,7 +258,7 @@ class Scene:
     @cached_property
     def mapped_space(self) -> MappedSpace:
         """Where a camera can be according to landmarks and mapping images."""
-        from wheretolook.space.free_space import MappedSpace
+        from wheretolook.space.mapped_space import MappedSpace
 
         poses = np.empty((0, 3, 4)) if self.map.mapping_poses is None else self.map.mapping_poses
         return MappedSpace(self.landmarks.points, camera_centers(poses.astype(np.float64)), self.config.mapped_space)

@@ -117,7 +117,7 @@ class ErrorModel:
 
 @dataclass(frozen=True)
 class ConfidenceModel(LogisticRegression):
-    """Probability that a pose is right within an accuracy; 0 with fewer inliers than `MIN_INLIERS`."""
+    """Probability that a pose is right within an accuracy; 0 with fewer inliers than `MIN_INLIERS`, at most 0.5 below 12."""
 
     names = FEATURE_NAMES
     about = "confidence"
@@ -144,7 +144,10 @@ class ConfidenceModel(LogisticRegression):
             localization.deviation[1],
         )
         limits = zip(self.errors, accuracy, localization.deviation, strict=True)
-        return float(self.predict_proba(features)) * min(model.p_below(limit, own) for model, limit, own in limits)
+        place = float(self.predict_proba(features))
+        probability = place * min(model.p_below(limit, own) for model, limit, own in limits)
+        # random matches of features that hardly match reach eleven inliers, with which poses were not fitted
+        return probability if localization.n_inliers >= 12 else min(probability, 0.5)
 
 
 def probabilities(localization: JointLocalization, accuracy: Accuracy = ACCURACY) -> Float:

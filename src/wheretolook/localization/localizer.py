@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -10,19 +10,28 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from wheretolook.dataset.config import LOCALIZED, NO_POSE, TOO_FEW_MATCHES
-from wheretolook.features.extractor import KINDS, ExtractorConfig, KeypointExtractor, Keypoints, kind_of
+from wheretolook.features.extractor import (
+    KINDS,
+    ExtractorConfig,
+    KeypointExtractor,
+    Keypoints,
+    kind_of,
+    unit_descriptors,
+)
 from wheretolook.features.matches import Matches, match
 from wheretolook.features.matching import MAX_NEAREST, DescriptorIndex, DescriptorMatcher, SimilarityMatcher, has_index
 from wheretolook.geometry.camera import Camera
-from wheretolook.geometry.poses import Float, pose_error
+from wheretolook.geometry.poses import Float, pose_error, transform
 from wheretolook.geometry.similarity import poses_from
 from wheretolook.localization.config import LocalizerConfig
 from wheretolook.localization.estimation import PoseEstimator
 from wheretolook.localization.lightglue import LightGlueMatcher
 from wheretolook.localization.rig import Look
 from wheretolook.localization.rig_localization import POSES_OF_AN_IMAGE, JointLocalizer
+from wheretolook.mapping.colmap_model import ModelArrays
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.utils.errors import MapError
 
@@ -144,6 +153,32 @@ class Localizer:
             Matches(*self._guided.match(query, size, first.landmarks), first.near, first.squared)
             for query, first in zip(keypoints, matches, strict=True)
         ]
+
+    def check_weights(self, images: ModelArrays, photographs: Iterable[tuple[int, NDArray[np.uint8], Camera]]) -> bool:
+        """Check that learned descriptors of mapping images match those of the landmarks that they observe.
+
+        Photographs are rows of `images`, of whose points all are landmarks, pixels (H, W, 3) uint8 and cameras of that
+        size. Returns False if they observe too few landmarks to decide. Raises MapError if the weights of the extractor
+        are not those of the map.
+        """
+        landmark = np.repeat(np.searchsorted(self.landmarks.ids, images.point_ids), np.diff(images.observation_start))
+        n_seen = n_found = 0
+        for row, rgb, camera in photographs:
+            keypoints = self.extractor.extract(rgb)
+            seen = landmark[images.observation_image == row]
+            n_seen += len(seen)
+            if len(keypoints) and len(seen):
+                pixels = camera.project(transform(images.image_poses[row], self.landmarks.points[seen]))
+                distance, nearest = cKDTree(keypoints.pixels).query(np.nan_to_num(pixels, nan=-1e6))
+                cosine = (unit_descriptors(self._descriptors[seen]) * keypoints.descriptors[nearest]).sum(1)
+                n_found += np.count_nonzero((distance < 1.5) & (cosine >= self.kind.min_similarity))  # pixels
+        if n_seen < 20:
+            return False
+        if n_found < 0.1 * n_seen:  # of images of another size still a quarter
+            problem = f"the extractor finds {n_found} of the {n_seen} landmarks in mapping images again"
+            fix = f"Give the weights of the map's {self.kind.name} features: --extractor-weights."
+            raise MapError(problem, value=self._extractor.weights or "default weights", fix=fix)
+        return True
 
     @cached_property
     def joint(self) -> JointLocalizer:

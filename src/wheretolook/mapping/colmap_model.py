@@ -325,11 +325,12 @@ def _reprojections(model: Any) -> list[Float]:
     for image in images[:: 1 + len(images) // 50]:
         rows = image.get_observation_point2D_idxs()
         observed = [image.points2D[row] for row in rows[:: 1 + len(rows) // 20]]
+        observed = [point for point in observed if point.point3D_id in model.points3D]
         projected = [image.project_point(model.points3D[point.point3D_id].xyz) for point in observed]
         behind = (np.nan, np.nan)
         pairs = [(behind if at is None else at, point.xy) for at, point in zip(projected, observed, strict=True)]
         sample.append(np.array(pairs, dtype=np.float64))
-    return [pixels for pixels in sample if np.ptp(pixels[:, 1], axis=0).any()]
+    return [pixels for pixels in sample if len(pixels) and np.ptp(pixels[:, 1], axis=0).any()]
 
 
 def _warn_of_larger(folder: Path, n_images: int) -> None:

@@ -154,6 +154,12 @@ def kind_in_name(path: Path) -> DescriptorKind | None:
     return next(kinds, None)
 
 
+def weights_in_name(path: Path | str) -> str:
+    """Name of the weights of ALIKED that a file of features or weights is named after, such as "aliked-n16"; "" for none."""
+    found = re.search(r"aliked[-_]?(t16|n16rot|n16|n32)", Path(path).stem.lower())
+    return f"aliked-{found[1]}" if found else ""
+
+
 def _kind_by_columns(named: DescriptorKind | None, columns: int) -> DescriptorKind | None:
     """The kind of learned descriptors: the named one, or the only one of this dimension; else None.
 

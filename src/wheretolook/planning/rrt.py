@@ -93,6 +93,7 @@ def plan_path(
     ends = np.asarray([start, goal], dtype=np.float64)
     request = PathRequest(ends, np.array(bounds, dtype=np.float64), space, config)
     check_ends(ends, space, request.bounds)
+    viewpoint_map = viewpoint_map and viewpoint_map.in_frame(Similarity())
     if viewpoint_map is None and start_axis is not None:
         raise PlanningError("a start axis needs a viewpoint map", value=start_axis)
     problem = _Problem(request, viewpoint_map)

@@ -18,6 +18,7 @@ from wheretolook.dataset.scene import Scene
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.lattices import ViewLattice, VoxelGrid
 from wheretolook.geometry.poses import Float, poses_looking_along, rotation_looking_along, transform
+from wheretolook.geometry.similarity import Similarity
 from wheretolook.geometry.views import Views
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.landmarks import Landmarks
@@ -39,7 +40,7 @@ Text = str | None  # text of progress bars; None shows none
 def build_viewpoint_map(
     scorer: Scorer, grid: VoxelGrid, free: ArrayLike, directions: ArrayLike, lattice: str = "", progress: Text = None
 ) -> ViewpointMap:
-    """Score every direction at the centre of every free voxel of a grid.
+    """Score every direction at the centre of every free voxel of a grid; the result answers in the map's own frame.
 
     Args:
         scorer: any method, on the localization map to be used.
@@ -67,7 +68,7 @@ def build_viewpoint_map(
     row_of_voxel[rows] = np.arange(len(rows))
     ranked, scores, n_visible = _score_and_count(scorer, grid.centers()[rows], axes, progress)
     digests = landmark_digests(landmarks)
-    return ViewpointMap(
+    in_world = ViewpointMap(
         grid=grid,
         row_of_voxel=row_of_voxel,
         directions=axes,
@@ -78,6 +79,7 @@ def build_viewpoint_map(
         landmark_digests=digests,
         origin=_origin(scorer, lattice, digests),
     )
+    return in_world.in_frame(scorer.localization_map.frame.world_from_map)
 
 
 def landmark_digests(landmarks: Landmarks) -> NDArray[np.uint64]:
@@ -172,12 +174,12 @@ def scene_viewpoint_map(scene: Scene, views: ViewLattice, scorer: Scorer) -> Vie
 
 
 def planner_map(scene: Scene, views: ViewLattice, scorer: Scorer) -> ViewpointMap:
-    """Build the map for planners: scores in [0, 1], and views wherever a camera can be.
+    """Build the map for planners: in the world, scores in [0, 1], and views wherever a camera can be.
 
     Scores that are no probabilities are replaced by ranks, and partially free voxels are filled. Raises as
     `scene_viewpoint_map`.
     """
-    scored = scene_viewpoint_map(scene, views, scorer)
+    scored = scene_viewpoint_map(scene, views, scorer).in_frame(Similarity())
     if not is_probability(scored.origin.scorer):
         scored = shares_below(scored)
     return fill_partially_free_voxels(scored, scene.space)

@@ -21,8 +21,10 @@ from wheretolook.geometry.poses import (
     turns_from_deg,
     within,
 )
+from wheretolook.geometry.similarity import Similarity
 from wheretolook.geometry.views import Views
 from wheretolook.looks.selection import best_views
+from wheretolook.robot.wheretolook_robot import description_digest
 from wheretolook.utils.errors import ConfigError, MapFormatError
 from wheretolook.utils.files import atomic_folder, read_json, save_npy, sha256, write_json, write_text
 from wheretolook.utils.processes import hold
@@ -32,14 +34,14 @@ if TYPE_CHECKING:
 
 
 FORMAT = "wheretolook viewpoint map"
-VERSION = 1
+VERSION = 2
 
 DESCRIPTION = "viewpoint_map.json"
 LAYOUT = "LAYOUT.txt"
 
 ARRAYS = {
     "row_of_voxel": ("<i4", "V", "row of each voxel in the arrays by row, -1 if it is not free"),
-    "directions": ("<f8", "D, 3", "unit optical axes in the world"),
+    "directions": ("<f8", "D, 3", "unit optical axes in the map's own frame"),
     "ranked": ("<u2", "L, D", "ids of the directions, the best first"),
     "scores": ("<f4", "L, D", "by direction id"),
     "n_visible": ("<u4", "L, D", "landmarks in view, by direction id"),
@@ -57,9 +59,12 @@ A viewpoint map, version {version}: where to point a camera so that it knows whe
 For every free voxel of a scene, every direction of a lattice is ranked by how well a camera there would localize.
 
 FRAMES AND UNITS
-  World: metres, z up. A direction is the unit vector, in the world, that the camera's optical axis points along. The
-  camera (x right, y down, z forward) does not roll: its x axis is level. If it looks straight up or down, x is world x.
-  With direction f, the rows of the rotation cam_from_world are
+  Points and directions are in the own frame and unit of the model that the map was made from. The grid is in the world:
+  metres, z up. With the numbers under "frame" in viewpoint_map.json (rotation by rows)
+    world = scale * rotation * point + translation.
+  A direction is the unit vector that the camera's optical axis points along. The camera (x right, y down, z forward)
+  does not roll: its x axis is level. If it looks straight up or down, x is world x.
+  With f = rotation * direction, the rows of the rotation cam_from_world are
     right = (f.y, -f.x, 0) / |(f.y, -f.x, 0)|,  down = f x right,  forward = f.
 
 FILES
@@ -72,9 +77,9 @@ FILES
   row-major, not compressed.
 
 FROM A POINT TO ITS VOXEL
-  "grid" has lower and upper (corners, metres) and shape (voxels along x, y, z). For p within lower and upper, both
-  included, and for each axis a:
-    i[a] = min(floor((p[a] - lower[a]) / size[a]), shape[a] - 1),  size[a] = (upper[a] - lower[a]) / shape[a]
+  "grid" has lower and upper (corners, metres) and shape (voxels along x, y, z). For w, the point in the world, within
+  lower and upper, both included, and for each axis a:
+    i[a] = min(floor((w[a] - lower[a]) / size[a]), shape[a] - 1),  size[a] = (upper[a] - lower[a]) / shape[a]
     voxel = (i[x] * shape[y] + i[y]) * shape[z] + i[z]
     row = row_of_voxel[voxel]; -1: not free, there is nothing here for a camera. Rows count up with voxels.
   Scores were computed at the voxel's centre, lower + (i + 0.5) * size.
@@ -92,9 +97,11 @@ IN C++, the best direction at a point (for little-endian machines):
   }}
   int64_t voxel = 0;
   for (int a = 0; a < 3; ++a) {{
-    if (!(p[a] >= lower[a] && p[a] <= upper[a])) return -1;
+    const double* r = rotation[a];
+    double w = scale * (r[0] * p[0] + r[1] * p[1] + r[2] * p[2]) + translation[a];
+    if (!(w >= lower[a] && w <= upper[a])) return -1;
     double size = (upper[a] - lower[a]) / shape[a];
-    voxel = voxel * shape[a] + std::min<int64_t>((p[a] - lower[a]) / size, shape[a] - 1);
+    voxel = voxel * shape[a] + std::min<int64_t>((w - lower[a]) / size, shape[a] - 1);
   }}
   int32_t row = values<int32_t>(row_of_voxel_npy)[voxel];
   return row < 0 ? -1 : values<uint16_t>(ranked_npy)[row * int64_t(D)];
@@ -106,7 +113,11 @@ LANDMARKS
 
 
 def write_map(
-    folder: str | Path, grid: VoxelGrid, origin: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]
+    folder: str | Path,
+    grid: VoxelGrid,
+    world_from_map: Similarity,
+    origin: Mapping[str, Any],
+    arrays: Mapping[str, NDArray[Any]],
 ) -> None:
     """Write a viewpoint map into a folder; a folder that holds nothing but another one is replaced in one step.
 
@@ -119,7 +130,26 @@ def write_map(
     folder = Path(folder).resolve()  # so that "." has a name too
     _check_replaceable(folder)
     with hold(folder.with_name(f".{folder.name}.lock"), "viewpoint map", wait_s=120.0), atomic_folder(folder) as new:
-        _write(new, grid, origin, arrays)
+        checksums = {}
+        for name, (kind, _, _) in ARRAYS.items():
+            save_npy(new / f"{name}.npy", np.ascontiguousarray(arrays[name], dtype=kind))
+            checksums[f"{name}.npy"] = sha256(new / f"{name}.npy")
+        files = "\n".join(
+            f"  {name + '.npy':<20}{np.dtype(kind).name:<9}({shape + ')':<7}{meaning}"
+            for name, (kind, shape, meaning) in ARRAYS.items()
+        )
+        write_text(new / LAYOUT, _TEXT.format(version=VERSION, files=files))
+        n_rows, n_directions = arrays["scores"].shape
+        content = {
+            "format": FORMAT,
+            "version": VERSION,
+            "grid": {name: np.asarray(getattr(grid, name)).tolist() for name in ("lower", "upper", "shape")},
+            "frame": world_from_map.record(),
+            "sizes": {"V": len(grid), "L": n_rows, "D": n_directions, "N": len(arrays["landmark_ids"])},
+            "origin": dict(origin),
+            "sha256": checksums,
+        }
+        write_json(new / DESCRIPTION, {**content, "digest": description_digest(content)})
 
 
 def _check_replaceable(folder: Path) -> None:
@@ -136,30 +166,10 @@ def _check_replaceable(folder: Path) -> None:
         raise MapFormatError("the folder holds something else than a viewpoint map", path=folder, fix=fix)
 
 
-def _write(folder: Path, grid: VoxelGrid, origin: Mapping[str, Any], arrays: Mapping[str, NDArray[Any]]) -> None:
-    checksums = {}
-    for name, (kind, _, _) in ARRAYS.items():
-        save_npy(folder / f"{name}.npy", np.ascontiguousarray(arrays[name], dtype=kind))
-        checksums[f"{name}.npy"] = sha256(folder / f"{name}.npy")
-    files = "\n".join(
-        f"  {name + '.npy':<20}{np.dtype(kind).name:<9}({shape + ')':<7}{meaning}"
-        for name, (kind, shape, meaning) in ARRAYS.items()
-    )
-    write_text(folder / LAYOUT, _TEXT.format(version=VERSION, files=files))
-    n_rows, n_directions = arrays["scores"].shape
-    content = {
-        "format": FORMAT,
-        "version": VERSION,
-        "grid": {name: np.asarray(getattr(grid, name)).tolist() for name in ("lower", "upper", "shape")},
-        "sizes": {"V": len(grid), "L": n_rows, "D": n_directions, "N": len(arrays["landmark_ids"])},
-        "origin": dict(origin),
-        "sha256": checksums,
-    }
-    write_json(folder / DESCRIPTION, content)
-
-
-def read_map(folder: str | Path, mmap: bool = False) -> tuple[VoxelGrid, dict[str, Any], dict[str, NDArray[Any]]]:
-    """Read the grid, origin and arrays that `write_map` wrote.
+def read_map(
+    folder: str | Path, mmap: bool = False
+) -> tuple[VoxelGrid, Similarity, dict[str, Any], dict[str, NDArray[Any]]]:
+    """Read the grid, the transformation from the map's own frame, the origin and the arrays that `write_map` wrote.
 
     With `mmap` the files are mapped into memory, read-only: sizes and types are checked, but not the checksums, for
     which every byte would have to be read. Raises MapFormatError if there is no map, or it is damaged or of another
@@ -173,9 +183,13 @@ def read_map(folder: str | Path, mmap: bool = False) -> tuple[VoxelGrid, dict[st
         content = read_json(path)
         if (content["format"], content["version"]) != (FORMAT, VERSION):
             raise ValueError(f"not a viewpoint map of version {VERSION}")
+        if content.pop("digest") != description_digest(content):
+            raise ValueError("changed since it was written")
         bounds = np.array([content["grid"]["lower"], content["grid"]["upper"]], dtype=np.float64)
         nx, ny, nz = (int(side) for side in content["grid"]["shape"])
         grid = VoxelGrid.over(bounds, (nx, ny, nz))
+        frame = content["frame"]
+        world_from_map = Similarity(frame["scale"], np.array(frame["rotation"]), np.array(frame["translation"]))
         origin, sizes, checksums = (dict(content[name]) for name in ("origin", "sizes", "sha256"))
         sizes["V"] = nx * ny * nz
         shapes = {
@@ -190,10 +204,12 @@ def read_map(folder: str | Path, mmap: bool = False) -> tuple[VoxelGrid, dict[st
         arrays[name] = _read(file, ARRAYS[name][0], shape, mmap)
         if not mmap and sha256(file) != checksums.get(file.name):
             raise MapFormatError("damaged: the checksum differs", path=file, fix=REBUILD)
-    return grid, origin, arrays
+    return grid, world_from_map, origin, arrays
 
 
 def _read(path: Path, kind: str, shape: tuple[int, ...], mmap: bool) -> NDArray[Any]:
+    if not path.is_file():  # a pipe would never end
+        raise MapFormatError("missing, or not a file", path=path, fix=REBUILD)
     try:
         # a plain array over the mapped memory, because np.memmap is slow to index
         array = np.asarray(np.load(path, mmap_mode="r" if mmap else None, allow_pickle=False))
@@ -213,7 +229,7 @@ class ViewChoice(NamedTuple):
 
     Attributes:
         direction_id: row in the map's directions.
-        axis: (3,) unit optical axis in the world, read-only; the camera does not roll.
+        axis: (3,) unit optical axis in the map's own frame, read-only; the camera does not roll.
         score: by the map's scorer.
         n_visible: number of landmarks in view from the voxel's centre.
     """
@@ -256,13 +272,15 @@ class ViewpointMap:
 
     A point gets the scores of its voxel, which were computed at the centre; `interpolated` is smooth between centres.
     For points outside the grid or in voxels that are not free, queries of one point return None, and batches
-    the direction -1. Points that are not finite raise a ValueError. See `map_building.build_viewpoint_map`.
+    the direction -1. Points that are not finite raise a ValueError. See `scene_map.build_viewpoint_map`.
+
+    Points, directions and poses are in the map's own frame and unit, as those of `WhereToLook`; the grid is in the world.
 
     Attributes:
         grid: V voxels of the world, metres, z up.
         row_of_voxel: (V,) int32, row of each free voxel in the arrays below, in ascending order; -1 for other voxels.
             In derived maps voxels may share rows.
-        directions: (D, 3) float64 unit optical axes in the world.
+        directions: (D, 3) float64 unit optical axes in the map's own frame.
         ranked: (L, D) uint16, ids of the directions at each of L free voxels, by falling score (in double precision),
             then by rising id.
         scores: (L, D) float32, by direction id.
@@ -270,6 +288,7 @@ class ViewpointMap:
         landmark_ids: (N,) int64, ascending.
         landmark_digests: (N, 2) uint64, digests of each landmark's position and of its attributes, for updates.
         origin: method, camera and so on.
+        world_from_map: from the map's own frame to the world.
     """
 
     grid: VoxelGrid
@@ -281,6 +300,7 @@ class ViewpointMap:
     landmark_ids: NDArray[np.int64]
     landmark_digests: NDArray[np.uint64]
     origin: MapOrigin
+    world_from_map: Similarity = Similarity()
 
     def __post_init__(self) -> None:
         rows = self.row_of_voxel
@@ -302,9 +322,9 @@ class ViewpointMap:
 
         Raises MapFormatError if there is no map, or it is damaged or of another version.
         """
-        grid, origin, arrays = read_map(folder, mmap)
+        grid, world_from_map, origin, arrays = read_map(folder, mmap)
         try:
-            return cls(grid=grid, origin=MapOrigin(**origin), **arrays)
+            return cls(grid=grid, origin=MapOrigin(**origin), world_from_map=world_from_map, **arrays)
         except (TypeError, ValueError) as error:
             raise MapFormatError(f"damaged: {error}", path=Path(folder), fix=REBUILD) from error
 
@@ -317,7 +337,13 @@ class ViewpointMap:
         if derived := origin.pop("derived"):
             fix = "Save the map it was derived from."
             raise MapFormatError("a derived map cannot be saved", path=Path(folder), value=derived, fix=fix)
-        write_map(folder, self.grid, origin, {name: getattr(self, name) for name in ARRAYS})
+        arrays = {name: getattr(self, name) for name in ARRAYS}
+        write_map(folder, self.grid, self.world_from_map, origin, arrays)
+
+    def in_frame(self, world_from_map: Similarity) -> ViewpointMap:
+        """Return the same map for points and directions in another frame."""
+        directions = self.directions @ self.world_from_map.rotation.T @ world_from_map.rotation
+        return replace(self, directions=directions, world_from_map=world_from_map)
 
     @property
     def voxel_of_row(self) -> NDArray[np.int64]:
@@ -329,12 +355,14 @@ class ViewpointMap:
 
     @property
     def locations(self) -> Float:
-        """Centres (L, 3) m of the free voxels; raises as `voxel_of_row`."""
-        return self.grid.centers()[self.voxel_of_row]
+        """Centres (L, 3) of the free voxels; raises as `voxel_of_row`."""
+        return self.world_from_map.inverse.apply(self.grid.centers()[self.voxel_of_row])
 
     def row(self, point: Point) -> int:
-        """Return the row of the free voxel that contains a world point (3,) m; -1 if none does."""
-        x, y, z = map(float, point)  # faster than NumPy's scalars
+        """Return the row of the free voxel that contains a point (3,); -1 if none does."""
+        x, y, z = map(
+            float, point if self._is_world else self.world_from_map.apply(point)
+        )  # faster than NumPy's scalars
         x0, y0, z0, x1, y1, z1, dx, dy, dz, nx, ny, nz, rows = self._hash
         if x0 <= x <= x1 and y0 <= y <= y1 and z0 <= z <= z1:
             i = int((x - x0) / dx)
@@ -350,12 +378,12 @@ class ViewpointMap:
         return -1
 
     def best(self, point: Point) -> ViewChoice | None:
-        """Return the best orientation at a world point (3,) m."""
+        """Return the best orientation at a point (3,)."""
         row = self.row(point)
         return None if row < 0 else self._choice(row, self.ranked.item(row, 0))
 
     def best_n(self, point: Point, n: int) -> list[ViewChoice] | None:
-        """Return the n best orientations at a world point (3,) m, or all if there are fewer, the best first.
+        """Return the n best orientations at a point (3,), or all if there are fewer, the best first.
 
         Raises ValueError if n is less than 1.
         """
@@ -365,7 +393,7 @@ class ViewpointMap:
         return None if row < 0 else [self._choice(row, choice) for choice in self.ranked[row, :n].tolist()]
 
     def best_in_cone(self, point: Point, axis: ArrayLike, half_angle_deg: float) -> ViewChoice | None:
-        """Return the best orientation whose optical axis is at most `half_angle_deg` from a world axis (3,), or None.
+        """Return the best orientation whose optical axis is at most `half_angle_deg` from an axis (3,), or None.
 
         Raises ValueError if the axis is not finite or has no length.
         """
@@ -376,15 +404,16 @@ class ViewpointMap:
         """Return the best orientation that the camera reaches by a single rotation of at most `max_turn_deg`.
 
         The angle is that of the whole camera's rotation (`turns_deg`). `current` is the (3,) axis of a camera without
-        roll, or a (3, 3) cam_from_world rotation. Returns None also if no direction of the lattice is in reach. Raises
+        roll, or the (3, 3) rotation of its pose. Returns None also if no direction of the lattice is in reach. Raises
         ValueError if `current` is not finite, an axis without length, or no rotation (such as a reflection).
         """
-        return self._best_of(self.row(point), within(turns_from_deg(current, self._rotations), max_turn_deg))
+        turned = np.asarray(current, dtype=np.float64) @ self.world_from_map.rotation.T
+        return self._best_of(self.row(point), within(turns_from_deg(turned, self._rotations), max_turn_deg))
 
     def best_looks(
         self, point: Point, n: int, max_turn_deg: float | None = None, *, scorer: Scorer, start: ArrayLike | None = None
     ) -> list[ViewChoice] | None:
-        """Return the n orientations at a world point (3,) m with the highest joint score, in the order to look.
+        """Return the n orientations at a point (3,) with the highest joint score, in the order to look.
 
         The map's scores preselect orientations; their joint score is computed at the point itself by the `scorer` that
         the map was built with (`wheretolook.looks.selection.best_views`). The camera
@@ -400,18 +429,21 @@ class ViewpointMap:
         row = self.row(point)
         if row < 0:
             return None
-        at = np.asarray(point, dtype=np.float64)
-        chosen = best_views(scorer, at, self.directions, self.scores[row], n, max_turn_deg, start)
+        at = self.world_from_map.apply(point)
+        turn = self.world_from_map.rotation.T
+        first = None if start is None else np.asarray(start, dtype=np.float64) @ turn
+        chosen = best_views(scorer, at, self.directions @ turn, self.scores[row], n, max_turn_deg, first)
         return [self._choice(row, look) for look in chosen.rows]
 
     def best_many(self, points: ArrayLike) -> Views:
-        """Return the best view at each of world points (N, 3) m, with `direction_id`, `score` and `n_visible`.
+        """Return the best view at each of points (N, 3), with `direction_id`, `score` and `n_visible`.
 
         Where no voxel is free, `direction_id` is -1, poses and scores are NaN, and `n_visible` is 0. Raises as `rows`.
         """
         rows = self.rows(points)
         ids, scores, n_visible = self._best_of_rows
-        rotations = np.concatenate([self._rotations, np.full((1, 3, 3), np.nan)])[ids[rows]]  # the last for -1
+        rotations = self._rotations @ self.world_from_map.rotation
+        rotations = np.concatenate([rotations, np.full((1, 3, 3), np.nan)])[ids[rows]]  # the last for -1
         translations = -rotations @ np.asarray(points, dtype=np.float64)[..., None]
         return Views(
             np.concatenate([rotations, translations], axis=-1),
@@ -422,25 +454,25 @@ class ViewpointMap:
         )
 
     def rows(self, points: ArrayLike) -> NDArray[np.int64]:
-        """Return the rows (N,) of the free voxels that contain world points (N, 3) m; -1 where none does.
+        """Return the rows (N,) of the free voxels that contain points (N, 3); -1 where none does.
 
         Raises ValueError for points of another shape, or not finite.
         """
         at = np.asarray(points, dtype=np.float64)
         if at.ndim != 2 or at.shape[1] != 3 or not np.isfinite(at).all():
             raise ValueError(f"points must be finite and of shape (N, 3), got shape {at.shape}")
-        ids = self.grid.location_ids(at)
+        ids = self.grid.location_ids(self.world_from_map.apply(at))
         return np.where(ids >= 0, self.row_of_voxel[ids], -1).astype(np.int64)
 
     def interpolated(self, point: Point) -> Float | None:
-        """Interpolate the scores (D,) float64 of all directions at a world point (3,) m between the centres of voxels.
+        """Interpolate the scores (D,) float64 of all directions at a point (3,) between the centres of voxels.
 
         Neighbours that are not free or outside the grid are left out and the other weights normalized. None if the
         voxel that holds the point is not free.
         """
         if self.row(point) < 0:
             return None
-        at = (np.asarray(point, dtype=np.float64) - self.grid.lower) / self.grid.voxel_m - 0.5
+        at = (self.world_from_map.apply(point) - self.grid.lower) / self.grid.voxel_m - 0.5
         low = np.floor(at).astype(np.int64)
         upper = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), axis=-1).reshape(8, 3)
         corners = low + upper
@@ -481,7 +513,13 @@ class ViewpointMap:
 
     @cached_property
     def _rotations(self) -> Float:
-        return rotation_looking_along(self.directions)
+        """Rotations (D, 3, 3) from the world to the camera."""
+        return rotation_looking_along(self.directions @ self.world_from_map.rotation.T)
+
+    @cached_property
+    def _is_world(self) -> bool:
+        frame = self.world_from_map
+        return frame.scale == 1 and np.array_equal(frame.rotation, np.eye(3)) and not frame.translation.any()
 
     @cached_property
     def _best_of_rows(self) -> tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.int64]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import csr_array
 
 from wheretolook.dataset.config import ACCURACY, Accuracy, checked_accuracy
-from wheretolook.features.extractor import ExtractorConfig, Keypoints, kind_of, runnable_extractors
+from wheretolook.features.extractor import EXTRACTORS, KINDS, ExtractorConfig, Keypoints, kind_of, runnable_extractors
 from wheretolook.features.matches import Matches
 from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.poses import Float
@@ -25,12 +26,13 @@ from wheretolook.localization.rig import IDENTITY, Look, PosePrior, checked_turn
 from wheretolook.localization.rig_localization import POSES_OF_A_VIEW, POSES_OF_AN_IMAGE, JointLocalizer
 from wheretolook.mapping.colmap_model import ModelArrays, observation_matrix
 from wheretolook.mapping.config import FrameOptions
+from wheretolook.mapping.feature_files import HDF5_SUFFIXES, weights_in_name
 from wheretolook.mapping.georeference import REPORT_FILE
 from wheretolook.mapping.landmarks import Landmarks
-from wheretolook.mapping.map import Map, find_features
+from wheretolook.mapping.map import Map, find_features, find_photographs, has_image
 from wheretolook.mapping.map_frame import MapFrame
 from wheretolook.select.localized import Localized, QueryImage, QueryImages, distinct_names
-from wheretolook.utils.errors import ConfigError, MapError, PoseError, TableError, from_record
+from wheretolook.utils.errors import ConfigError, MapError, MapWarning, PoseError, TableError, from_record
 from wheretolook.utils.files import path_ends, read_json_object, read_text
 
 
@@ -118,12 +120,41 @@ class ImageLocalizer:
         opened = Map.open_described(path, database, frame, device)
         landmarks = opened.landmarks
         assert opened.images is not None
-        features = database or (find_features(path) if lightglue else None)
+        learned = not KINDS[landmarks.features].in_bytes
+        features = database or (find_features(path) if lightglue or learned else None)
         extractor = extractor or _extractor_of(path, landmarks)
         of_images = None if pairs is None else ImagePairs.read(pairs, opened.images)
         result = cls(landmarks, opened.frame, QueryImages(opened), extractor, device, of_images, lightglue, features)
         _ = result._localizer.extractor  # so that another extractor and missing weights are reported once
+        if learned:
+            result._check_weights(opened)
         return result
+
+    def _check_weights(self, opened: Map) -> None:
+        """Compare the extractor with the map's learned descriptors: in two photographs, otherwise by the files' names.
+
+        A `MapWarning` names weights that are assumed. Raises MapError for others than the map's.
+        """
+        images = opened.images
+        assert images is not None
+        folder = find_photographs(self.images.folder)
+        photographs = []
+        for row in np.argsort(-np.bincount(images.observation_image, minlength=len(images.image_ids)), kind="stable"):
+            name = images.image_names[row]
+            if folder is not None and len(photographs) < 2 and has_image(folder, name):
+                image = self.images.read(folder / name, name, opened.cameras[int(images.image_cameras[row])])
+                photographs.append((int(row), image.rgb, image.camera))
+        if self._localizer.check_weights(images, photographs):
+            return
+        weights = self.extractor.weights or EXTRACTORS[self.extractor.method].weights
+        used = weights_in_name(weights)
+        of_map = "" if self.features is None else weights_in_name(self.features)
+        if used and of_map and used != of_map:
+            fix = f"Give --extractor {self.extractor.method} --extractor-weights {of_map}.pth."
+            raise MapError(f"the map has features of {of_map}", path=self.features, value=weights, fix=fix)
+        if used != of_map and self.features is not None and self.features.suffix in HDF5_SUFFIXES:
+            text = f"{self.features}: features of {of_map or self.landmarks.features} are assumed to be by {weights}"
+            warnings.warn(text, MapWarning, stacklevel=3)
 
     @cached_property
     def _localizer(self) -> Localizer:

@@ -28,7 +28,7 @@ from wheretolook.scorers.registry import make_scorer
 from wheretolook.scorers.weights import load_scorer, resolve_weights
 from wheretolook.select.selection import explained, reported, select_views
 from wheretolook.select.waypoints import SelectionRequest, Waypoints, grid_waypoints, usable_waypoints
-from wheretolook.space.free_space import MappedSpace
+from wheretolook.space.mapped_space import MappedSpace
 from wheretolook.utils.devices import usable_device
 from wheretolook.utils.errors import ConfigError, MapError, PlanningError, check_names
 

@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import distance_transform_edt, map_coordinates
-from scipy.spatial import cKDTree
 from tqdm.auto import tqdm
 
 from wheretolook.geometry.lattices import VoxelGrid
@@ -15,70 +14,7 @@ from wheretolook.geometry.mesh import TexturedMesh
 from wheretolook.geometry.poses import Float
 from wheretolook.geometry.tsdf import DepthImages, TsdfVolume
 from wheretolook.rendering.raycasting import MeshRaycaster, RayHits
-from wheretolook.space.config import FreeSpaceConfig, MappedSpaceConfig
-from wheretolook.utils.errors import MapError
-
-
-class MappedSpace:
-    """Tests locations against a map's landmarks (N, 3) m and the places (M, 3) m where its images were taken.
-
-    `bounds` (2, 3) m is the box around the cameras, enlarged by `max_camera_distance_m`, within the box around cameras
-    and landmarks (without the outermost per cent along each axis). Raises MapError without landmarks or cameras.
-    """
-
-    def __init__(
-        self, landmarks: ArrayLike, cameras: ArrayLike, config: MappedSpaceConfig = MappedSpaceConfig()
-    ) -> None:
-        self.config = config
-        points, centers = (np.asarray(values, dtype=np.float64).reshape(-1, 3) for values in (landmarks, cameras))
-        if not len(points) or not len(centers):
-            value = (len(points), len(centers))
-            fix = "Run the map stage again."
-            raise MapError("the map has no landmarks or no cameras", value=value, fix=fix)
-        self._landmarks = cKDTree(points)
-        self._cameras = cKDTree(centers)
-        reach = self.config.max_camera_distance_m
-        lowest = centers.min(0)
-        highest = centers.max(0)
-        low, high = np.quantile(points, (0.01, 0.99), axis=0)
-        lower = np.maximum(lowest - reach, np.minimum(low, lowest))
-        upper = np.minimum(highest + reach, np.maximum(high, highest))
-        self.bounds: Float = np.stack([lower, upper])
-
-    def is_free(self, points: ArrayLike) -> NDArray[np.bool_]:
-        """Whether a camera can be at points (N, 3) metres; (N,)."""
-        at = np.asarray(points, dtype=np.float64).reshape(-1, 3)
-        free = ((at >= self.bounds[0]) & (at <= self.bounds[1])).all(axis=1)
-        free &= self._cameras.query(at)[0] <= self.config.max_camera_distance_m
-        free &= self._landmarks.query(at)[0] >= self.config.clearance_m
-        return free
-
-    def segments_are_free(self, a: ArrayLike, b: ArrayLike) -> NDArray[np.bool_]:
-        """Whether a camera can move straight from a (N, 3) to b (N, 3) metres; (N,).
-
-        Both ends must be free, no landmark may be closer to the segment than the clearance, and the segment must stay
-        near mapping cameras (tested every 2 cm).
-        """
-        ends = (np.asarray(points, dtype=np.float64).reshape(-1, 3) for points in (a, b))
-        start, end = np.broadcast_arrays(*ends)
-        free = self.is_free(start) & self.is_free(end)
-        for n in np.flatnonzero(free):
-            free[n] = self._is_clear(start[n], end[n]) and self._stays_near_cameras(start[n], end[n])
-        return free
-
-    def _is_clear(self, start: Float, end: Float) -> bool:
-        along = end - start
-        length = float(np.linalg.norm(along))
-        reach = length / 2 + self.config.clearance_m
-        near = self._landmarks.data[self._landmarks.query_ball_point((start + end) / 2, reach)]
-        share = np.clip((near - start) @ along / max(length**2, 1e-24), 0, 1)
-        distance = np.linalg.norm(near - start - share[:, None] * along, axis=1)
-        return bool((distance >= self.config.clearance_m).all())
-
-    def _stays_near_cameras(self, start: Float, end: Float) -> bool:
-        steps = max(2, int(np.ceil(np.linalg.norm(end - start) / 0.02)) + 1)
-        points = start + np.linspace(0, 1, steps)[:, None] * (end - start)
-        return bool((self._cameras.query(points)[0] <= self.config.max_camera_distance_m).all())
+from wheretolook.space.config import FreeSpaceConfig
 
 
 class FreeSpace:

@@ -56,7 +56,7 @@ def _frames(viewed: ViewedMap, state: ViewState) -> Iterator[drawing.Rgb]:
         paths.append(replace(path, method=name, good=good))
     heights = paths[1].positions[:, 2]
     house = dollhouse(viewed.mesh, elevation_deg=62, cut_m=float(heights.max()) + 0.3, width_px=700)
-    n_frames = min(max(len(filmed.path) for filmed in paths), 60)
+    n_frames = min(max(len(filmed) for filmed in paths), 60)
     for share in tqdm(np.linspace(0, 1, n_frames), desc="film", unit="frame"):
         with context(RC):
             figure = new_figure(7.6, 4.3)

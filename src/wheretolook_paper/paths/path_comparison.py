@@ -32,7 +32,8 @@ from wheretolook.planning.view_sequence import (
     lengths_along,
 )
 from wheretolook.planning.viewpoint_map import ViewpointMap
-from wheretolook.space.free_space import FreeSpace, MappedSpace
+from wheretolook.space.free_space import FreeSpace
+from wheretolook.space.mapped_space import MappedSpace
 from wheretolook.utils.errors import PlanningError, SceneError
 from wheretolook_paper.paths.config import PathsConfig
 

@@ -8,7 +8,7 @@ from holdout.rendered_room import write_rendered_room
 from wheretolook.geometry.poses import camera_centers, poses_looking_along
 from wheretolook.holdout.photo_map import features_of, open_map
 from wheretolook.mapping.config import FrameOptions
-from wheretolook.space.free_space import MappedSpace
+from wheretolook.space.mapped_space import MappedSpace
 from wheretolook.utils.errors import PlanningError
 from wheretolook_paper.evaluation.comparison import replace_rows
 from wheretolook_paper.figures.paths import AXIS, LANDMARKS_CSV, PATHS_CSV, POSITION

@@ -117,7 +117,7 @@ def test_sift_in_a_database_above_the_model_is_used(tmp_path, model_dir):
     assert Map.open(model_dir).landmarks.features == "sift"
     database.unlink()
     write_database(database, model, [k[:2] for k in keypoints], [d[:2] for d in descriptors])  # of another model
-    with pytest.warns(MapWarning, match="not used"):
+    with pytest.warns(MapWarning, match="disagree on the number"):
         assert Map.open(model_dir).landmarks.features == ""
     with pytest.raises(MapError):
         Map.open(model_dir, database)

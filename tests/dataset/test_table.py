@@ -128,7 +128,17 @@ def test_damaged_files(compact, many, tmp_path):
             read_table(path)
 
 
-@pytest.mark.parametrize("change", [{"qw": 2.0}, {"x_m": np.nan}, {"error_m": "near"}, {"error_m": None}])
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"qw": 2.0},
+        {"x_m": np.nan},
+        {"error_m": "near"},
+        {"error_m": None},
+        {"n_visible": pd.NA},
+        {"location_id": pd.NA},
+    ],
+)
 def test_columns_that_are_missing_or_invalid(change, many, tmp_path):
     path = tmp_path / "viewpoints.parquet"
     write_table(many, path, compact=True)

@@ -13,7 +13,7 @@ from localization.test_joint import in_view
 from wheretolook.commands.options import MeshSource, ScenesConfig
 from wheretolook.commands.scenes import Scenes
 from wheretolook.dataset.viewpoint_files import FIRST_FIELDS, MATCH_FIELDS, SCHEMA, read_table, write_table
-from wheretolook.dataset.viewpoint_table import LOCALIZED, TOO_FEW_MATCHES, by_first, is_good, poses
+from wheretolook.dataset.viewpoint_table import LOCALIZED, TOO_FEW_MATCHES, is_good, poses, with_first_labels
 from wheretolook.features.extractor import Keypoints
 from wheretolook.features.matches import Matches
 from wheretolook.geometry.camera import ColmapCamera, PinholeCamera
@@ -90,13 +90,13 @@ def test_several_hypotheses_also_label_by_the_first_ransac_result(room, views, t
         label_rows(views, room.job, Localizer(landmarks, CAMERA, LocalizerConfig(method)), renderer)
         for method in ("first", "hypotheses")
     )
-    pd.testing.assert_frame_equal(by_first(both)[[*first]], first)
+    pd.testing.assert_frame_equal(with_first_labels(both)[[*first]], first)
     assert first["status"].nunique() > 1 and not both["n_inliers"].equals(first["n_inliers"])
     for compact in (False, True):
         write_table(both, tmp_path / "both.parquet", compact)
         stored = read_table(tmp_path / "both.parquet")
         assert [*stored] == [*SCHEMA.names, *FIRST_FIELDS.names]
-        pd.testing.assert_frame_equal(by_first(stored)[["status", "error_m"]], first[["status", "error_m"]])
+        pd.testing.assert_frame_equal(with_first_labels(stored)[["status", "error_m"]], first[["status", "error_m"]])
     assert [*label_rows(stored, room.job, Localizer(landmarks, CAMERA), renderer)] == SCHEMA.names
 
 

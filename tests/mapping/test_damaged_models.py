@@ -75,6 +75,31 @@ def test_text_models_with_marks_and_ends_of_lines_of_windows(tmp_path):
     assert read.num_points3D() == model.num_points3D()
 
 
+@pytest.mark.parametrize("name", ["points3D.bin", "frames.bin", "images.bin", "points3D.txt", "frames.txt"])
+def test_sparse_files_of_terabytes_are_not_read(tmp_path, name):
+    """A billion records of zeros are announced; the file takes no space on the disk."""
+    folder = written(rig_model(), tmp_path / "model", text=name.endswith("txt"))
+    with (folder / name).open("r+b") as file:
+        if name.endswith("bin"):
+            file.truncate(0)
+            file.write(struct.pack("<Q", 10**9))
+        file.truncate(2**41)
+    with pytest.raises(MapError) as caught:
+        read_model(folder)
+    assert caught.value.path == folder / name
+
+
+def test_a_frame_whose_quaternion_has_length_0(tmp_path):
+    """Its matrix would be the identity."""
+    path = written(rig_model(), tmp_path / "model") / "frames.bin"
+    content = bytearray(path.read_bytes())
+    content[16:48] = bytes(32)
+    path.write_bytes(content)
+    with pytest.raises(MapError, match="rotation") as caught:
+        read_model(path.parent)
+    assert caught.value.path == path
+
+
 @pytest.mark.parametrize("text", [False, True])
 def test_poses_of_images_replace_frames_that_contradict_the_points(tmp_path, text):
     """Programs from before COLMAP 3.12 write cameras, images and points, and leave older rigs and frames in the folder."""

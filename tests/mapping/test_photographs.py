@@ -7,13 +7,7 @@ import pytest
 from PIL import Image
 
 from wheretolook.mapping.config import PhotographsConfig
-from wheretolook.mapping.photographs import (
-    list_photographs,
-    photograph_cameras,
-    photograph_pairs,
-    read_photograph,
-    reduce_photograph,
-)
+from wheretolook.mapping.photographs import list_photographs, photograph_cameras, read_photograph, reduce_photograph
 from wheretolook.utils.errors import ConfigError, MapError
 
 ORIENTATION = 0x0112
@@ -135,11 +129,3 @@ def test_intrinsics_can_be_given(tmp_path):
     save(tmp_path / "c.jpg", sized(360, 240))
     with pytest.raises(ConfigError):
         cameras_of(tmp_path, config)
-
-
-def test_few_are_matched_all_with_all_and_many_in_turn():
-    assert photograph_pairs(4, 10, 2).tolist() == [[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]]
-    pairs = photograph_pairs(100, 60, 10)
-    steps = pairs[:, 1] - pairs[:, 0]
-    assert set(steps.tolist()) == {*range(1, 11), 16, 32, 64}
-    assert len(np.unique(pairs, axis=0)) == len(pairs) < 100 * 13

@@ -101,6 +101,8 @@ def test_detection_is_learned_and_the_set_network_starts_from_it(dataset, traine
         {"scale": "x"},
         {"scale": -1},
         {"range": "x"},
+        {"range": {"distance_m": [5.0, 1.0]}},
+        {"range": {"distance_m": [float("nan"), 1.0]}},
         {},
         None,
     ],

@@ -8,10 +8,12 @@ from learning_options import train_config
 from synthetic_dataset import make_dataset
 from wheretolook.cli import command_options, load_command, main
 from wheretolook.commands.train import train_methods
+from wheretolook.dataset.config import LOCK
 from wheretolook.dataset.dataset_lock import changing, reading
 from wheretolook.tracking import TrackingConfig
 from wheretolook.training.trained_network import TrainedNetwork
 from wheretolook.utils.errors import InUseError
+from wheretolook.utils.processes import hold
 
 
 @pytest.fixture
@@ -40,6 +42,14 @@ def test_a_stage_stops_at_once_beside_one_that_changes_the_dataset(dataset, stag
         assert run(dataset, stage) == 2
     said = capsys.readouterr().err
     assert f"label, process {os.getpid()} on " in said
+
+
+def test_a_scene_is_checked_while_another_is_mapped(dataset, capsys):
+    mapped, other = dataset.scenes[:2]
+    with changing(dataset.root, "map"), hold(mapped.folder / LOCK, "map"):
+        for scene, said in ((mapped, f"map, process {os.getpid()}"), (other, "no COLMAP model here")):
+            assert main(["check", "--scene", scene.name, "--data", str(dataset.root.parent)]) == 2
+            assert said in capsys.readouterr().err
 
 
 def test_training_holds_the_labels_that_it_reads(dataset, monkeypatch):

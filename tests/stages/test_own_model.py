@@ -235,7 +235,7 @@ def test_landmarks_are_triangulated_again_at_known_poses(tmp_path):
     markers = MarkerConfig(marker_size_m=MARKERS[0].size_m)
     config = ImportConfig(tmp_path / "photos", scale=markers, model=folder, frame=FrameOptions(up="z"))
     report = map_existing(config, tmp_path / "map", tmp_path / "work", progress=False)
-    assert report.triangulated_anew and report.has_descriptors and report.n_points == 0
+    assert report.retriangulated and report.has_descriptors and report.n_points == 0
     assert report.scale.source == "markers" and report.scale.factor == pytest.approx(1, abs=0.005)
     found = read_model(tmp_path / "map")
     assert found.num_points3D() == report.n_landmarks > 1000

@@ -14,7 +14,7 @@ from wheretolook.cli import parse_command
 from wheretolook.commands.options import open_scene
 from wheretolook.dataset.layout import Dataset
 from wheretolook.dataset.viewpoint_files import read_table
-from wheretolook.dataset.viewpoint_table import by_first, is_good, poses
+from wheretolook.dataset.viewpoint_table import is_good, poses, with_first_labels
 from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import camera_centers
@@ -202,7 +202,7 @@ def test_labels_by_another_localizer_replace_the_old_ones_when_they_are_finished
     assert {scene: scene.table.read_bytes() for scene in scenes} == before
     assert run(*hypotheses) == 0
     for scene, by_one in zip(scenes, plain, strict=True):
-        pd.testing.assert_frame_equal(by_first(scene.read_table())[[*by_one]], by_one)
+        pd.testing.assert_frame_equal(with_first_labels(scene.read_table())[[*by_one]], by_one)
         assert not (scene.folder / "shards").exists()
     assert run("label", copy) == 0
     assert {scene: scene.table.read_bytes() for scene in scenes} == before

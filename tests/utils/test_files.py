@@ -85,7 +85,6 @@ INVALID = [
     (read_json, text("[" * 100_000 + "]" * 100_000)),
     (read_json, lambda path: path.write_bytes(bytes(MAX_TEXT_BYTES + 1))),
     (read_json_object, text("[]")),
-    (read_yaml, text("a: 2001-99-99")),
     (read_yaml, text("a: 1\nb: {c: 2, c: 3}")),
     (read_yaml, text("!!python/object/apply:os.system ['true']")),
 ]
@@ -110,7 +109,7 @@ def test_good_files_are_read_as_they_were_written(tmp_path):
     assert read_json(path) == read_json_object(path) == content
     settings = "base: &base {grid: 1.5, when: 2001-01-02}\nsample: {<<: *base, n: 3}\nlist: [*base, no, ~]\n"
     path.write_text(settings)
-    assert read_yaml(path) == yaml.safe_load(settings)
+    assert read_yaml(path) == yaml.safe_load(settings.replace("2001-01-02", "'2001-01-02'"))  # a name, not a date
     arrays = {"text": np.array("mesh"), "fortran": np.asfortranarray(np.arange(6.0).reshape(2, 3)), "n": np.array(5)}
     for compress in (False, True):
         save_npz(path, arrays, compress)

@@ -30,6 +30,14 @@ def test_a_killed_process_is_a_typed_error():
         list(processes.map(die, range(6)))
 
 
+def test_a_script_without_a_guard_is_named(tmp_path):
+    script = tmp_path / "script.py"
+    work = "from wheretolook.utils.processes import WorkerPool\nwith WorkerPool(2) as pool:\n    print(*pool.map(abs, [-1]))\n"
+    script.write_text(work)
+    run = subprocess.run([sys.executable, script], capture_output=True, text=True, timeout=60)
+    assert f"{script}: worker processes import this script" in run.stderr
+
+
 def pid_after(seconds):
     time.sleep(seconds)
     return os.getpid()

@@ -168,8 +168,8 @@ class Check(ScorerOptions, FrameOptions):
         scoring.check()
         out = self.out or folder_of_check(self.data, name)
         with ExitStack() as locks:
-            if scene is not None:  # no command may change it meanwhile
-                locks.enter_context(hold(scene.folder.parent / LOCK, "check", shared=True))
+            if scene is not None:  # no command may change it meanwhile; others may be mapped
+                locks.enter_context(hold(scene.folder / LOCK, "check", shared=True))
             locks.enter_context(hold(out / ".lock", "check"))
             photographs, occlusion = self._open(scene, out / WORK, device, workers)
             report = check_map(photographs, out / WORK, scoring, occlusion, self.views, workers, device)

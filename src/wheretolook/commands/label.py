@@ -147,11 +147,11 @@ def _shards(files: SceneFolder) -> Path:
 
 
 def _report(files: SceneFolder, table: pd.DataFrame, log: Log) -> None:
-    from wheretolook.dataset.viewpoint_table import by_first, has_first, is_good
+    from wheretolook.dataset.viewpoint_table import has_first, is_good, with_first_labels
 
     text = f"{is_good(table).mean():.0%} of {len(table):,} viewpoints localize within 5 cm and 0.4 degrees"
     if has_first(table):
-        first = by_first(table)
+        first = with_first_labels(table)
         limit_m, limit_deg = RIGHT_PLACE_LIMITS
         near, near_first = (is_good(labels, limit_m, limit_deg).mean() for labels in (table, first))
         text += f" ({is_good(first).mean():.0%} by the first RANSAC result), "

@@ -29,6 +29,7 @@ from wheretolook.commands.options import (
     refuse_release,
     select_options,
 )
+from wheretolook.dataset.config import LOCK
 from wheretolook.dataset.dataset_lock import changes_dataset
 from wheretolook.dataset.layout import Dataset, SceneFolder
 from wheretolook.features.extractor import ExtractorConfig
@@ -43,6 +44,7 @@ from wheretolook.mapping.photograph_map import map_photographs
 from wheretolook.mapping.photographs import list_photographs
 from wheretolook.utils.errors import ConfigError, MapError, SceneError, reject
 from wheretolook.utils.files import cache_key, check_folder_name, fingerprint, path_within, size_and_time
+from wheretolook.utils.processes import hold
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -149,15 +151,19 @@ class BuildMap(SceneOptions, LabelOptions, FrameOptions):
         if self.model is None and self.photographs.images is None:
             dataset = load_dataset(self, "scenes")
             for files in dataset.scenes:
-                _map_mesh(self, files, log)
+                with hold(files.folder / LOCK, "map"):
+                    _map_mesh(self, files, log)
                 progress(1)
             return dataset
         refuse_release(self.root)
-        if self.model is not None:
-            scene, dataset = _import_model(self, log)
-        else:
-            scene = _map_photographs(self, log)
-            dataset = _with_scene(scene, self.root)
+        source = self.model or self.photographs.images
+        assert source is not None
+        with hold(_new_scene(self, source).folder / LOCK, "map"):
+            if self.model is not None:
+                scene, dataset = _import_model(self, log)
+            else:
+                scene = _map_photographs(self, log)
+                dataset = _with_scene(scene, self.root)
         frame = read_frame(scene.map)
         about = "; ".join((frame.describe(), *frame.doubts))
         log(f"{scene.name}: {about}; camera {describe_camera(scene.camera)}")
@@ -253,6 +259,9 @@ def _map_photographs(options: BuildMap, log: Log) -> SceneFolder:
     cache.store()
     used_images = f"{report.n_registered} of {report.n_images} photographs"
     log(f"{scene.name}: {report.n_landmarks:,} landmarks from {used_images} -> {scene.map}")
+    if len(report.mappers) > 1:
+        tried = ", ".join(f"{mapper} {n}" for mapper, n in report.mappers.items())
+        log(f"{scene.name}: photographs placed by each mapping that was tried: {tried}; the best is kept")
     if report.unregistered:
         log(f"{scene.name}: not placed: {', '.join(report.unregistered)}")
     return _with_mapping_camera(options, scene)
@@ -305,7 +314,7 @@ def _import_model(options: BuildMap, log: Log) -> tuple[SceneFolder, Dataset]:
         save_glb(loaded, scene.mesh)
     cache.store()
     removed = f", {report.n_landmarks_removed:,} points removed" if report.n_landmarks_removed else ""
-    again = ", triangulated again," if report.triangulated_anew else ""
+    again = ", triangulated again," if report.retriangulated else ""
     log(f"{scene.name}: {report.n_landmarks:,} landmarks{again} from {report.n_images} images{removed} -> {scene.map}")
     return scene, dataset
 

@@ -19,12 +19,13 @@ from wheretolook.commands.options import (
     mesh_fingerprint,
     refuse_release,
 )
-from wheretolook.dataset.config import Split
+from wheretolook.dataset.config import LOCK, Split
 from wheretolook.dataset.dataset_lock import changes_dataset
 from wheretolook.dataset.layout import Dataset, MappedFloor, SceneFolder
 from wheretolook.scenes.config import ApartmentConfig, SceneKind
 from wheretolook.utils.errors import ConfigError, SceneError, TableError
 from wheretolook.utils.files import ArtifactCache, cache_key, storage_errors
+from wheretolook.utils.processes import hold
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -68,7 +69,8 @@ class Scenes(DatasetOptions):
             if scene.stage_cache("scenes", key).is_current(scene.mesh):
                 log(f"{scene.name}: reusing {scene.mesh}")
             else:
-                save_scene(scene, make, key, log)
+                with hold(scene.folder / LOCK, "scenes"):
+                    save_scene(scene, make, key, log)
             progress(1)
         dataset = self._dataset(tuple(sources))
         dataset.save()

@@ -135,7 +135,12 @@ def read_table(path: Path, matches: bool = False, pixels: bool = False) -> pd.Da
                     fix = f"Label again with `--label.store_{'pixels' if pixels else 'matches'} true`; "
                     fix += "compact tables never hold them."
                 raise TableError("columns are missing", path=path, value=missing, fix=fix)
-            frame: pd.DataFrame = file.read(schema.names).cast(schema).to_pandas()
+            content = file.read(schema.names).cast(schema)
+            # NaN is stored as null, and means that a number is unknown; ids, counts and texts are known
+            lacking = [f.name for f in schema if not pa.types.is_floating(f.type) and content[f.name].null_count]
+            if lacking:
+                raise ValueError(f"values are missing in {', '.join(lacking)}")
+            frame: pd.DataFrame = content.to_pandas()
     except ValueError as error:
         raise TableError(f"not a readable table of viewpoints: {error}", path=path, fix=fix) from error
     length = np.linalg.norm(frame[[*QUATERNION_COLUMNS]], axis=1)

@@ -62,7 +62,7 @@ def has_first(table: pd.DataFrame) -> bool:
     return f"{FIRST}{LABELS[0]}" in table
 
 
-def by_first(table: pd.DataFrame) -> pd.DataFrame:
+def with_first_labels(table: pd.DataFrame) -> pd.DataFrame:
     """Replace columns of a table by those of the same name with the prefix `FIRST`."""
     return table.assign(**{str(name).removeprefix(FIRST): table[name] for name in table if str(name).startswith(FIRST)})
 
@@ -102,7 +102,7 @@ def _views(scene: str, table: pd.DataFrame, split: str, both: bool) -> pd.DataFr
     height = camera_centers(poses(table))[:, 2]
     height = np.round(height - height.min(), 6)  # so that all views of a location fall into one band
     labels = {}
-    labelled = {"": table, FIRST: by_first(table)} if both else {"": table}
+    labelled = {"": table, FIRST: with_first_labels(table)} if both else {"": table}
     for prefix, by in labelled.items():
         for name, (error_m, error_deg) in zip(POSITIVE, THRESHOLDS, strict=True):
             labels[f"{prefix}{name}"] = is_good(by, error_m, error_deg)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.special import gammaln
 
 from wheretolook.dataset.layout import SceneFolder
-from wheretolook.dataset.viewpoint_table import by_first, has_first, is_good, poses
+from wheretolook.dataset.viewpoint_table import has_first, is_good, poses, with_first_labels
 from wheretolook.evaluation.config import EvaluateConfig, candidates_label
 from wheretolook.geometry.poses import Float, camera_centers
 from wheretolook.geometry.views import Views
@@ -119,7 +119,7 @@ def _scene_views(number: int, scene: SceneFolder, table: pd.DataFrame, config: E
         raise TableError("the table has no viewpoints", path=scene.table, fix="Run the sample stage again.")
     try:
         good = []
-        for labelled in [table, by_first(table)] if both else [table]:
+        for labelled in [table, with_first_labels(table)] if both else [table]:
             good += [is_good(labelled, max_m, max_deg) for max_m, max_deg in config.thresholds]
     except TableError as error:
         raise TableError(error.problem, path=scene.table, value=error.value, fix=error.fix) from None

@@ -124,7 +124,6 @@ DISK = DescriptorKind("disk", 128, "float16", min_similarity=0.8)
 XFEAT = DescriptorKind("xfeat", 64, "float16", min_similarity=0.82)
 # hloc's "NN-superpoint" matches up to a distance of 0.7 between unit descriptors: 1 - 0.7^2 / 2
 SUPERPOINT = DescriptorKind("superpoint", 256, "float16", min_similarity=0.755)
-KINDS = {kind.name: kind for kind in (SIFT, ALIKED, DISK, XFEAT, SUPERPOINT)}
 
 EXTRACTORS = {
     "opencv": Extractor("opencv", SIFT, "sift:OpenCvSift"),
@@ -161,6 +160,7 @@ EXTRACTORS = {
     ),
     "superpoint": Extractor("superpoint", SUPERPOINT, lightglue="superpoint"),
 }
+KINDS = {extractor.descriptors.name: extractor.descriptors for extractor in EXTRACTORS.values()}
 
 
 def runnable_extractors() -> tuple[str, ...]:

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     import pycolmap
 
 MAX_SIDE_PX = 10**6  # of an image; COLMAP's limit is not much higher
-MAX_PX = 1e12  # of a focal length or a principal point, whose products stay finite; and no integers without end
+MAX_PX = 1e12  # of a focal length or a principal point, so that products stay finite and huge integers are refused
 
 
 class _Image:
@@ -156,7 +156,7 @@ def _check_intrinsics(width: int, height: int, focal_px: tuple[float, ...]) -> N
 class ColmapCamera(_Image):
     """A camera of any COLMAP model.
 
-    Beyond the field of view that they were fitted to, distortion polynomials turn back and map points far outside of it
+    Beyond the field of view that they were fitted to, distortion polynomials are not monotonic and map points far outside of it
     into the image. So a point counts as visible only if the ray of its pixel, by COLMAP's own inverse, leads back to it.
     COLMAP's fisheye models see nothing at 90 degrees from the axis and beyond. Raises ConfigError if COLMAP has no such
     model, or the model takes other parameters.

@@ -24,7 +24,7 @@ class Similarity:
         return np.asarray(self.scale * np.asarray(points, dtype=np.float64) @ self.rotation.T + self.translation)
 
     def apply_to_poses(self, poses: ArrayLike) -> NDArray[np.float64]:
-        """Transform cameras from world poses (..., 3, 4) of the source's frame to those of the target's."""
+        """Convert poses (..., 3, 4) cam_from_source to cam_from_target."""
         poses = np.asarray(poses, dtype=np.float64)
         rotation = poses[..., :3] @ self.rotation.T
         translation = self.scale * poses[..., 3:] - rotation @ self.translation[:, None]
@@ -47,7 +47,7 @@ class Similarity:
 
 
 def local_origin(points: ArrayLike) -> Float:
-    """Whole hundreds of metres near the median of the finite ones of points (N, 3) m, (3,): 0 for most scenes."""
+    """Return the median (3,) of the finite points among (N, 3) m, rounded to 100 m: 0 for most scenes."""
     at = np.asarray(points, dtype=np.float64).reshape(-1, 3)
     at = at[np.isfinite(at).all(1)]
     center = np.median(at, axis=0) if len(at) else np.zeros(3)
@@ -55,7 +55,7 @@ def local_origin(points: ArrayLike) -> Float:
 
 
 def poses_from(cam_from_world: ArrayLike, origin: ArrayLike) -> Float:
-    """Transform poses (..., 3, 4) to a world whose origin is at `origin` (3,) m of theirs; minus the origin undoes it."""
+    """Move the origin of the world of poses (..., 3, 4) to `origin` (3,) m; `-origin` is the inverse."""
     poses = np.array(cam_from_world, dtype=np.float64)
     poses[..., 3] += poses[..., :3] @ np.asarray(origin, dtype=np.float64)
     return poses

@@ -21,7 +21,7 @@ from wheretolook.features.extractor import (
     kind_of,
     unit_descriptors,
 )
-from wheretolook.features.matches import Matches, match
+from wheretolook.features.matches import Matches, has_twins, match
 from wheretolook.features.matching import MAX_NEAREST, DescriptorIndex, DescriptorMatcher, SimilarityMatcher, has_index
 from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.poses import Float, pose_error, transform
@@ -123,23 +123,38 @@ class Localizer:
         """Match keypoints of an image with the landmarks in rows (R,) alone, by their descriptors."""
         if len(rows) == 0:
             return Matches.none(len(keypoints))
-        (found,) = self.match_descriptors([keypoints], self._matcher_of(self._descriptors[rows]))
+        (found,) = self.match_descriptors([keypoints], rows)
         near = rows[np.minimum(found.near, len(rows) - 1)]  # with few landmarks, missing ones have large distances
         return found._replace(landmarks=rows[found.landmarks], near=near)
 
     def _matcher_of(self, descriptors: NDArray[Any]) -> Matcher:
         return (DescriptorMatcher if self.kind.in_bytes else SimilarityMatcher)(descriptors, self._device)
 
-    def match_descriptors(self, keypoints: Sequence[Keypoints], matcher: Matcher | None = None) -> list[Matches]:
-        """Match keypoints of several images with landmarks by their descriptors, also where LightGlue is configured."""
-        matcher = matcher or self._matcher
+    def match_descriptors(
+        self, keypoints: Sequence[Keypoints], among: NDArray[np.int64] | None = None
+    ) -> list[Matches]:
+        """Match keypoints of several images by their descriptors, also where LightGlue is configured.
+
+        `among` are rows (R,) of the landmarks to match with alone, among which matches are then numbered.
+        """
+        matcher = self._matcher if among is None else self._matcher_of(self._descriptors[among])
         descriptors = [self.kind.store(of_image.descriptors) for of_image in keypoints]
         several = self.config.method == "hypotheses"
         if isinstance(matcher, SimilarityMatcher):
             limit = self.config.min_similarity
             limit = self.kind.min_similarity if limit is None else limit
             return matcher.match(descriptors, limit, MAX_NEAREST if several else 1)
-        return match(matcher, descriptors, self.config.max_ratio, MAX_NEAREST if several else 2)
+        twins = self.twins if several else None
+        if twins is not None and among is not None:
+            twins = twins[among]
+        return match(matcher, descriptors, self.config.max_ratio, MAX_NEAREST if several else 2, twins)
+
+    @cached_property
+    def twins(self) -> NDArray[np.uint8] | None:
+        """Descriptors (N, 128) of the landmarks if they are copies of one another (`has_twins`) and matched by ratio."""
+        if isinstance(self._matcher, SimilarityMatcher):
+            return None
+        return self._descriptors if has_twins(self._matcher, self._descriptors, self.landmarks.points) else None
 
     def by_lightglue(
         self, keypoints: Sequence[Keypoints], matches: list[Matches], camera: Camera | None = None

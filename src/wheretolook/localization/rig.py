@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
-from wheretolook.features.matches import Matches
+from wheretolook.features.matches import Matches, is_twin
 from wheretolook.geometry.camera import Camera, field_of_view_deg
 from wheretolook.geometry.pose_files import (
     CAM_FROM_BASE,
@@ -213,11 +213,13 @@ class PosePrior:
         return np.asarray(allowed)
 
 
-def matches_among(matches: Matches, allowed: NDArray[np.bool_], max_ratio: float | None) -> Matches:
+def matches_among(
+    matches: Matches, allowed: NDArray[np.bool_], max_ratio: float | None, twins: NDArray[np.uint8] | None = None
+) -> Matches:
     """Match keypoints again with the allowed (N,) of their nearest landmarks.
 
     With a maximum ratio, the nearest allowed landmark is compared with the second nearest allowed one, or with the last
-    of the nearest if there is none. A landmark keeps its nearest keypoint.
+    of the nearest if there is none; not with a twin, as `match`. A landmark keeps its nearest keypoint.
     """
     near = allowed[matches.near]
     keypoints = np.flatnonzero(near.any(axis=1))
@@ -226,6 +228,8 @@ def matches_among(matches: Matches, allowed: NDArray[np.bool_], max_ratio: float
     rows = np.arange(len(keypoints))
     first = near.argmax(axis=1)
     near[rows, first] = False
+    if twins is not None:
+        near &= ~is_twin(matches.near[keypoints], matches.near[keypoints, first], twins)
     second = np.where(near.any(axis=1), near.argmax(axis=1), near.shape[1] - 1)
     distance = squared[rows, first]
     if max_ratio is not None:

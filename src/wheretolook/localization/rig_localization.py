@@ -137,6 +137,10 @@ class JointLocalizer:
     ) -> JointLocalization:
         """Localize one view or more, given each view's `single_view_poses` if known."""
         n_matches = sum(len(look.rows) for look in looks)
+        # a prior leads to poses by matches with the landmarks near it, where those with the whole map are too few
+        others = [len(inliers) for of_view in single_view_poses or () for _, inliers in of_view]
+        if n_matches < MIN_MATCHES:
+            n_matches = max([n_matches, *others])
         if n_matches < MIN_MATCHES:
             return JointLocalization(TOO_FEW_MATCHES, tuple(looks), n_matches)
         if single_view_poses is None:

@@ -12,6 +12,7 @@ from codecs import BOM_UTF8
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
+from mmap import ACCESS_READ, mmap
 from pathlib import Path
 from struct import Struct
 from struct import error as StructError
@@ -47,10 +48,10 @@ def check_binary(folder: Path) -> None:
     for name, record_length in lengths.items():
         path = folder / f"{name}.bin"
         if path.is_file():  # models from before COLMAP 3.12 have no frames
-            data = path.read_bytes()
+            data = _mapped(path)
             starts = _record_starts(data, record_length, path)
             if name == "points3D":
-                check_coordinates(_point_heads(np.frombuffer(data, dtype=np.uint8), starts), path)
+                check_coordinates(_point_heads(data, starts), path)
 
 
 def check_coordinates(points: NDArray[Any], path: Path) -> None:
@@ -66,8 +67,8 @@ def read_points(path: Path) -> tuple[NDArray[Any], NDArray[np.uint32]]:
 
     Reading 500,000 points one by one with pycolmap takes 15 seconds.
     """
-    data = np.fromfile(path, dtype=np.uint8)
-    starts = _record_starts(data.tobytes(), _point_length, path)
+    data = _mapped(path)
+    starts = _record_starts(data, _point_length, path)
     points = _point_heads(data, starts)
     order = np.argsort(points["id"])
     points = points[order]
@@ -77,11 +78,24 @@ def read_points(path: Path) -> tuple[NDArray[Any], NDArray[np.uint32]]:
     return points, _records(data, at, np.dtype(("<u4", 2)))
 
 
+def _mapped(path: Path) -> NDArray[np.uint8]:
+    """Bytes of a file, which are read where they are used: counts are checked before a sparse file of terabytes is read."""
+    if path.stat().st_size < _UINT64.size:
+        raise MapError("the file is truncated or corrupt", path=path, value=f"{path.stat().st_size} bytes", fix=REBUILD)
+    return np.memmap(path, dtype=np.uint8, mode="r")
+
+
 @contextmanager
 def without_marks(folder: Path, suffix: str) -> Iterator[Path]:
     """Yield a model's folder, or a copy of its texts without the byte-order marks that pycolmap cannot read."""
     names = ("cameras", "images", "points3D", "rigs", "frames") if suffix == ".txt" else ()
     texts = [path for name in names if (path := folder / (name + suffix)).is_file()]
+    for path in texts:
+        if path.stat().st_size == 0:  # cannot be mapped
+            continue
+        with path.open("rb") as file, mmap(file.fileno(), 0, access=ACCESS_READ) as content:
+            if content.find(b"\0") >= 0:  # the hole of a sparse file is one line of any length
+                raise MapError("the file is no text: it has a byte 0", path=path, fix=REBUILD)
     if not any(map(_has_mark, texts)):
         yield folder
         return
@@ -146,17 +160,29 @@ def _has_mark(path: Path) -> bool:
 def _is_pose(rigid: Any) -> bool:
     """Whether a `pycolmap.Rigid3d` is a rotation and a translation of usual size."""
     matrix = rigid.matrix()
+    if not np.linalg.norm(rigid.rotation.quat) > 0.5:  # of a quaternion of length 0 the matrix is the identity
+        return False
     with np.errstate(over="ignore", invalid="ignore"):
         is_rotation = np.abs(matrix[:, :3] @ matrix[:, :3].T - np.eye(3)).max() <= 0.01  # some tools write few decimals
     return bool(is_rotation and np.abs(matrix[:, 3]).max() <= _MAX_COORDINATE)
 
 
-def _record_starts(data: bytes, record_length: Callable[[bytes, int], int], path: Path) -> NDArray[np.int64]:
-    """Offsets of the records after a file's count, and of its end. Raises MapError if they do not fill the file."""
+def _record_starts(
+    data: NDArray[np.uint8], record_length: Callable[[memoryview, int], int], path: Path
+) -> NDArray[np.int64]:
+    """Offsets of the records after a file's count, and of its end.
+
+    Raises MapError if they do not fill the file, or one begins as the one before it, as in a file of zeros.
+    """
+    buffer = memoryview(data)
     starts = [_UINT64.size]
+    head = b""
     try:
-        for _ in range(_UINT64.unpack_from(data)[0]):
-            starts.append(starts[-1] + record_length(data, starts[-1]))
+        for _ in range(_UINT64.unpack_from(buffer)[0]):
+            before, head = head, bytes(buffer[starts[-1] : starts[-1] + 8])  # ids differ
+            if head == before:
+                raise ValueError("two records of one id")
+            starts.append(starts[-1] + record_length(buffer, starts[-1]))
     except (StructError, IndexError, ValueError, OverflowError):
         starts.append(-1)
     if starts[-1] != len(data):
@@ -179,16 +205,16 @@ def model_error(error: Exception, folder: Path, suffix: str) -> MapError:
     return MapError(f"pycolmap cannot read the model: {error}", path=path, fix=REBUILD)
 
 
-def _image_length(data: bytes, start: int) -> int:
-    name_end = data.index(b"\0", start + 64) + 1
+def _image_length(data: memoryview, start: int) -> int:
+    name_end = start + 64 + bytes(data[start + 64 : start + 64 + 4097]).index(b"\0") + 1  # longer than any path
     return name_end + 8 + 24 * int(_UINT64.unpack_from(data, name_end)[0]) - start
 
 
-def _point_length(data: bytes, start: int) -> int:
+def _point_length(data: memoryview, start: int) -> int:
     return POINT.itemsize + 8 * int(_UINT64.unpack_from(data, start + POINT.itemsize - 8)[0])
 
 
-def _frame_length(data: bytes, start: int) -> int:
+def _frame_length(data: memoryview, start: int) -> int:
     return 68 + 16 * int(_UINT32.unpack_from(data, start + 64)[0])
 
 

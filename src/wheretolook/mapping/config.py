@@ -49,7 +49,7 @@ WALK = WalkStyle()
 PARTNERS = 10  # images that each image is matched with; time grows with their number
 MAX_EPIPOLAR_ERROR_PX = 2.0  # matches farther from the epipolar line are dropped; keypoints are accurate to a pixel
 MIN_TRIANGULATION_ANGLE_DEG = 1.5  # COLMAP's own limit
-EXHAUSTIVE_UP_TO = 60  # photographs of which all pairs are matched, in minutes; more are matched by their order
+EXHAUSTIVE_UP_TO = 60  # photographs of which all pairs are matched, in minutes; of more the most similar ones
 MARKER = "marker:"  # before the id of a marker as the end of a distance
 # Of a marker's side, or of the extent of known positions; a wrong size or name is off by more.
 SCALE_TOLERANCE_PERCENT = 5.0
@@ -198,7 +198,8 @@ class PhotographsConfig(SourceImages):
             Without them, they are refined from the EXIF focal length, or from 1.2 times the longer side where there is
             none.
         shared_camera: whether photographs of one folder, size and EXIF focal length share their intrinsics.
-        overlap: how many photographs that follow by name one is matched with; as many more at distances that double.
+        overlap: how many photographs that follow by name one is matched with, if they seem to be named in the order of
+            capture; as many more at distances that double.
         max_reprojection_error_px: landmarks with a larger mean reprojection error are removed. Hand-held photographs do
             not reach the 0.5 px of rendered images.
         up_in_camera: the direction up in the camera frame, if it is the same for all. (x, y, z) with x right, y down, z

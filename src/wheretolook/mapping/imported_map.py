@@ -35,7 +35,7 @@ class ExistingMapReport(MapReport):
     """Properties of a map from an existing model; `report.json`."""
 
     n_points: int  # points of the existing model
-    triangulated_anew: bool  # whether the landmarks were triangulated again, from the images
+    retriangulated: bool  # whether the landmarks were triangulated again, from the images
     has_descriptors: bool  # without them, ambiguity is unknown and nothing can be localized
     cameras: list[dict[str, Any]]  # COLMAP's intrinsics
     frame: dict[str, Any]  # the model's own, see `MapFrame.record`
@@ -93,7 +93,7 @@ def map_existing(
             **fields,
             seconds=run.clock.with_total(),
             n_points=n_points,
-            triangulated_anew=images is not None,
+            retriangulated=images is not None,
             has_descriptors=landmarks.descriptors is not None,
             cameras=describe_cameras(model),
             frame=frame.record(),

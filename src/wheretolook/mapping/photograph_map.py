@@ -11,6 +11,8 @@ from typing import Any
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from tqdm.auto import tqdm
 
 from wheretolook.features.extractor import DescriptorKind, Stored, kind_of
@@ -25,16 +27,18 @@ from wheretolook.mapping.photographs import (
     PhotographCameras,
     list_photographs,
     photograph_cameras,
-    photograph_pairs,
     read_photograph,
     reduce_photograph,
 )
+from wheretolook.mapping.retrieval import photograph_pairs
 from wheretolook.mapping.triangulation import extract_with_colors, fill_database, match_pairs, write_matches
 from wheretolook.utils.errors import ConfigError, MapError
 from wheretolook.utils.files import ArtifactCache, cache_key, storing_in_database, temporary_folder
 from wheretolook.utils.texts import quiet_colmap
 
 _MANIFEST = "steps.json"
+_MIN_IMAGES = 3  # of a model: two photographs do not determine a camera
+_MIN_INLIERS = 30  # as COLMAP needs to place a photograph
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,11 +56,12 @@ class PhotographFeatures:
 
 @dataclass(frozen=True, eq=False)
 class MappedPhotographs:
-    """The result of incremental mapping."""
+    """The result of mapping."""
 
     model: Any  # the largest `pycolmap.Reconstruction`, in a frame and scale of its own; photograph i has the id i + 1
     database: Path  # COLMAP's database of keypoints and verified matches
     model_sizes: list[int]  # photographs in each model, the largest first
+    mappers: dict[str, int]  # photographs in the largest model of each mapper that was tried
 
 
 def photograph_features(
@@ -81,28 +86,29 @@ def photograph_features(
     return PhotographFeatures(names, arrays["full_sizes"], arrays["sizes"], stored, colors, key, kind)
 
 
-def map_incrementally(
+def match_and_map(
     work: Path, features: PhotographFeatures, cameras: PhotographCameras, overlap: int, run: MapRun
 ) -> MappedPhotographs:
-    """Match photographs, verify the matches, and map incrementally (Schonberger and Frahm, CVPR 2016).
+    """Match photographs, verify the matches, and map incrementally (Schonberger and Frahm, CVPR 2016) or globally.
 
     Finished steps are cached in `work`. The worker processes match; COLMAP's bundle adjustment takes as many threads.
     Raises MapError if the photographs do not overlap enough for a map.
     """
     seed = run.seed % 2**31  # COLMAP keeps it in an int
-    pairs = photograph_pairs(len(features.names), EXHAUSTIVE_UP_TO, overlap)
-    key = cache_key(features.key, pairs.tolist())
+    key = cache_key(features.key, EXHAUSTIVE_UP_TO, overlap)
     database = work / "database.db"
 
     def match() -> dict[str, NDArray[Any]]:
+        pairs = photograph_pairs(features.stored, features.kind, EXHAUSTIVE_UP_TO, overlap)
         with storing_in_database(database):
             matches = list(match_pairs(features.stored, pairs, work, run.processes, run.progress, features.kind))
-        return {"matches": np.concatenate(matches), "counts": np.array([*map(len, matches)])}
+        return {"pairs": pairs, "matches": np.concatenate(matches), "counts": np.array([*map(len, matches)])}
 
     arrays = _cached_arrays(work, key, "matches", match)
     matches = np.split(arrays["matches"], np.cumsum(arrays["counts"])[:-1])
     intrinsics = [camera.todict() for camera in cameras.cameras]
-    key = cache_key(key, intrinsics, cameras.camera_of.tolist(), cameras.given, seed)
+    version = 2  # of the results
+    key = cache_key(version, key, intrinsics, cameras.camera_of.tolist(), cameras.given, seed)
     folder = work / "sparse"
     cache = ArtifactCache(work, key, "sparse", _MANIFEST)
     results = cache.load("sparse.json") if cache.is_current(database, folder) else None
@@ -112,10 +118,9 @@ def map_incrementally(
         shutil.rmtree(folder, ignore_errors=True)
         with storing_in_database(database):
             fill_database(database, _unposed_model(features, cameras), features.stored, features.kind)
-            write_matches(database, pairs, matches)
-            model_sizes = _reconstruct(database, folder, cameras, seed, run)
-        results = cache.store({"sparse.json": {"model_sizes": model_sizes}})
-    return MappedPhotographs(read_model(folder), database, results["sparse.json"]["model_sizes"])
+            write_matches(database, arrays["pairs"], matches)
+            results = cache.store({"sparse.json": _reconstruct(database, folder, cameras, seed, run)})
+    return MappedPhotographs(read_model(folder), database, **results["sparse.json"])
 
 
 def _cached_arrays(
@@ -163,32 +168,95 @@ def _unposed_model(features: PhotographFeatures, cameras: PhotographCameras) -> 
     return model
 
 
-def _reconstruct(database: Path, folder: Path, cameras: PhotographCameras, seed: int, run: MapRun) -> list[int]:
-    """Verify matches, map, and write the largest model. Returns the number of photographs in each, largest first."""
-    min_images = 3  # two photographs do not determine a camera
-    threads = run.processes.workers
+def _reconstruct(database: Path, folder: Path, cameras: PhotographCameras, seed: int, run: MapRun) -> dict[str, Any]:
+    """Verify matches, map, and write the largest model. Returns `model_sizes` and `mappers` of `MappedPhotographs`.
+
+    The next mapper is tried while the largest model has fewer than half of the photographs that verified matches
+    connect. Raises MapError if none of them gives a model.
+    """
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = seed
+    with quiet_colmap("ERROR"):
+        verifier = pycolmap.GeometricVerifierOptions(num_threads=run.processes.workers)
+        pycolmap.geometric_verification(str(database), verifier, two_view_geometry_options=verification)
+    enough = _connected(database, len(cameras.camera_of)) / 2
+    attempts: dict[str, Callable[[Path], dict[int, Any]]] = {
+        "incremental": lambda models: _map_incrementally(database, models, cameras, seed, run),
+        "incremental for forward motion": lambda models: _map_incrementally(database, models, cameras, seed, run, True),
+        "global": lambda models: _map_globally(database, models, cameras, seed, run),
+    }
+    best: list[Any] = []
+    mappers: dict[str, int] = {}
+    for name, attempt in attempts.items():
+        with temporary_folder(".partial", parent=folder.parent) as models, quiet_colmap("ERROR"):
+            pycolmap.set_random_seed(seed)
+            mapped = attempt(models).values()
+        found = sorted(mapped, key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
+        mappers[name] = found[0].num_reg_images() if found else 0
+        if mappers[name] > max([0, *(model.num_reg_images() for model in best)]):
+            best = found
+        if mappers[name] >= enough:
+            break
+    if not best:
+        fix = f"Give at least {_MIN_IMAGES} sharp photographs from different places, each of which overlaps the next;"
+        fix += " a focal length (mapping.photographs.camera_params) helps."
+        problem = f"the photographs do not overlap enough for a map (tried: {', '.join(mappers)})"
+        raise MapError(problem, path=database, fix=fix)
+    write_model(best[0], folder)
+    return {"model_sizes": [model.num_reg_images() for model in best], "mappers": mappers}
+
+
+def _connected(database: Path, n: int) -> int:
+    """Return how many of n photographs are connected by pairs with enough verified matches to place one by another."""
+    with pycolmap.Database.open(str(database)) as db:
+        pair_ids, n_inliers = db.read_two_view_geometry_num_inliers()
+    verified = [pair for pair, number in zip(pair_ids, n_inliers, strict=True) if number >= _MIN_INLIERS]
+    pairs = [pycolmap.pair_id_to_image_pair(pair) for pair in verified]
+    rows, columns = np.array(pairs, dtype=np.int64).reshape(-1, 2).T - 1
+    graph = coo_array((np.ones(len(rows)), (rows, columns)), shape=(n, n))
+    return int(np.bincount(connected_components(graph, directed=False)[1]).max())
+
+
+def _map_incrementally(
+    database: Path, models: Path, cameras: PhotographCameras, seed: int, run: MapRun, forward: bool = False
+) -> dict[int, Any]:
+    """Map with COLMAP's incremental mapper; `forward` also starts from pairs along the viewing direction."""
+    threads = run.processes.workers
     options = pycolmap.IncrementalPipelineOptions(random_seed=seed, num_threads=threads, extract_colors=False)
-    options.min_model_size = min_images
+    options.min_model_size = _MIN_IMAGES
     options.ba_refine_focal_length = options.ba_refine_extra_params = not cameras.given
     options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = not cameras.given
     options.triangulation.random_seed = options.mapper.random_seed = seed
     options.mapper.num_threads = threads
-    pycolmap.set_random_seed(seed)
+    if forward:
+        options.mapper.init_max_forward_motion = 1.0
+        options.mapper.init_min_tri_angle = 4.0
     bar = tqdm(total=len(cameras.camera_of), desc="map: register", disable=not run.progress, unit="image")
-    steps: Any = {"initial_image_pair_callback": lambda: bar.update(2), "next_image_callback": lambda: bar.update(1)}
-    with temporary_folder(".partial", parent=folder.parent) as models, quiet_colmap("ERROR"), bar:
-        verifier = pycolmap.GeometricVerifierOptions(num_threads=threads)
-        pycolmap.geometric_verification(str(database), verifier, two_view_geometry_options=verification)
-        mapped = pycolmap.incremental_mapping(str(database), str(models), str(models), options, **steps)
-    ordered = sorted(mapped.values(), key=lambda model: (-model.num_reg_images(), -model.num_points3D()))
-    if not ordered:
-        fix = f"Give at least {min_images} sharp photographs from different places, each of which overlaps the next;"
-        fix += " a focal length (mapping.photographs.camera_params) helps."
-        raise MapError("the photographs do not overlap enough for a map", path=database, fix=fix)
-    write_model(ordered[0], folder)
-    return [model.num_reg_images() for model in ordered]
+
+    def start_model() -> None:
+        bar.reset()  # a photograph may be in several models
+        bar.update(2)
+
+    steps: Any = {"initial_image_pair_callback": start_model, "next_image_callback": lambda: bar.update(1)}
+    with bar:
+        return dict(pycolmap.incremental_mapping(str(database), str(models), str(models), options, **steps))
+
+
+def _map_globally(database: Path, models: Path, cameras: PhotographCameras, seed: int, run: MapRun) -> dict[int, Any]:
+    """Map with COLMAP's global mapper (Pan et al., ECCV 2024); photographs that observe few points lose their pose."""
+    threads = run.processes.workers
+    options = pycolmap.GlobalPipelineOptions(random_seed=seed, num_threads=threads, min_model_size=_MIN_IMAGES)
+    adjustment = options.mapper.bundle_adjustment
+    adjustment.refine_focal_length = adjustment.refine_extra_params = not cameras.given
+    try:
+        mapped = dict(pycolmap.global_mapping(str(database), str(models), str(models), options))
+    except (RuntimeError, ValueError):  # too few pairs
+        return {}
+    for model in mapped.values():
+        for image in list(model.images.values()):
+            if image.has_pose and image.num_points3D < _MIN_INLIERS:
+                model.deregister_frame(image.frame_id)
+    return {number: model for number, model in mapped.items() if model.num_reg_images() >= _MIN_IMAGES}
 
 
 @dataclass(frozen=True)
@@ -198,6 +266,7 @@ class PhotographMapReport(MapReport):
     n_registered: int  # photographs that have a pose
     unregistered: list[str]  # names of the others
     model_sizes: list[int]  # photographs in each model that did not connect with another; the first is the map
+    mappers: dict[str, int]  # photographs that each mapper placed; the next was tried where these were few
     n_keypoints: int  # keypoints of all photographs
     cameras: list[dict[str, Any]]  # COLMAP's intrinsics of the reduced photographs
     n_known_focal: int  # cameras that started from a focal length that was given or is in the EXIF data
@@ -231,7 +300,7 @@ def map_photographs(
             features = photograph_features(images, work, run, config.max_side_px)
         with run.clock("map"):
             cameras = photograph_cameras(images, features.names, features.full_sizes, features.sizes, config)
-            mapped = map_incrementally(work, features, cameras, config.overlap, run)
+            mapped = match_and_map(work, features, cameras, config.overlap, run)
         model = mapped.model
         with run.clock("gravity"):
             poses = colmap_poses(work, model)
@@ -256,6 +325,7 @@ def map_photographs(
             n_registered=len(registered),
             unregistered=[name for name in features.names if name not in registered],
             model_sizes=mapped.model_sizes,
+            mappers=mapped.mappers,
             n_keypoints=sum(len(pixels) for pixels, _ in features.stored),
             cameras=describe_cameras(model),
             n_known_focal=cameras.n_known_focal,

@@ -165,18 +165,6 @@ def photograph_cameras(
     return PhotographCameras(cameras, np.array(camera_of, dtype=np.int64), len(config.camera_params) > 0)
 
 
-def photograph_pairs(n: int, exhaustive_up_to: int, overlap: int) -> NDArray[np.int64]:
-    """Choose pairs (P, 2) of n photographs to match, i < j: all pairs, if n does not exceed `exhaustive_up_to`.
-
-    Otherwise each with the `overlap` that follow it and as many at distances that double, as COLMAP's sequential
-    matching does. This needs no vocabulary tree, but names in the order of capture.
-    """
-    if n <= exhaustive_up_to:
-        return np.column_stack(np.triu_indices(n, 1)).astype(np.int64)
-    steps = sorted({*range(1, overlap + 1), *(2**power for power in range(overlap))})
-    return np.array([(i, i + step) for i in range(n) for step in steps if i + step < n], dtype=np.int64)
-
-
 def _camera(path: Path, size: list[int], config: PhotographsConfig) -> Any:
     """Initial intrinsics of a photograph at full size: given, or by the focal length in its EXIF data."""
     import pycolmap

@@ -26,7 +26,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from wheretolook.dataset.config import ACCURACY, Accuracy, checked_accuracy
 from wheretolook.features.extractor import quantize_descriptors
-from wheretolook.features.matches import match
+from wheretolook.features.matches import has_twins, match
 from wheretolook.features.opencv_sift import RootSift
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import (
@@ -126,6 +126,7 @@ class RobotLocalizer:
         self.n_landmarks = len(points)
         self._descriptors = np.zeros((128, padded), dtype=np.float32)
         self._descriptors[:, : len(points)] = descriptors.T
+        self._twins = descriptors if has_twins(self, descriptors, points) else None
         self._config = LocalizerConfig(method="hypotheses")
         self._localizer = JointLocalizer(PoseEstimator(points, self._config), turn_noise_deg, check_turns=True)
         self._points = points
@@ -183,13 +184,13 @@ class RobotLocalizer:
         ):
             problem = "finite pixels (K, 2) and descriptors (K, 128) uint8"
             raise ValueError(f"{problem}, not {at.shape} and {described.shape} {described.dtype}")
-        (matches,) = match(self, [described], self._config.max_ratio, NEAREST)
+        (matches,) = match(self, [described], self._config.max_ratio, NEAREST, self._twins)
         look = Look.of(at, matches, camera or self.camera)
         near: SingleViewPoses = ()
         if prior is not None:
             rough = PosePrior.of(prior, self._world_from_map)
             allowed = rough.allows(self._points, self._mapping_distance_m, look.camera)
-            of_prior = Look.of(at, matches_among(matches, allowed, self._config.max_ratio), look.camera)
+            of_prior = Look.of(at, matches_among(matches, allowed, self._config.max_ratio, self._twins), look.camera)
             near = self._localizer.single_view_poses(of_prior, 1)
         return RobotView(look, self._localizer.single_view_poses(look, POSES_OF_AN_IMAGE), near)
 

@@ -225,7 +225,7 @@ class ImageLocalizer:
             if near is not None:
                 max_ratio = self._localizer.config.max_ratio if self._localizer.kind.in_bytes else None
                 allowed = near.allows(self.landmarks.points, self.landmarks.mapping_distance_m, query.camera)
-                matches = matches_among(found[0], allowed, max_ratio)
+                matches = matches_among(found[0], allowed, max_ratio, self._localizer.twins)
                 poses[-1] += rig.single_view_poses(Look.of(keypoints.pixels, matches, query.camera, pose), 1)
         joint = rig.localize(looks, poses)
         return Localized.of(queries, joint, probabilities(joint, limits), self.frame)

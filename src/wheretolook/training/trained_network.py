@@ -76,7 +76,11 @@ class TrainingRange:
     def of_record(cls, record: Mapping[str, Any]) -> TrainingRange:
         """Return the range of a `record`; KeyError, TypeError, IndexError or ValueError if it is invalid."""
         bounds = dict(record)
-        return cls({name: (float(bounds[name][0]), float(bounds[name][1])) for name in QUANTITIES if name in bounds})
+        result = cls({name: (float(bounds[name][0]), float(bounds[name][1])) for name in QUANTITIES if name in bounds})
+        low, high = result._limits
+        if not (low <= high).all():
+            raise ValueError("a range is empty or not a number")
+        return result
 
     def at_accuracy(self, ratio: float) -> TrainingRange:
         """Return the range for an accuracy `ratio` times that of the training labels.

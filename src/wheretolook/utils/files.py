@@ -15,7 +15,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from contextlib import contextmanager, suppress
 from pathlib import Path, PurePath, PurePosixPath
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -295,11 +295,16 @@ def read_json_object(path: Path) -> dict[str, Any]:
 
 
 def read_yaml(path: Path) -> Any:
-    """Read a YAML file of plain values. Raises ValueError if it is none, or if a key is given twice."""
+    """Read a YAML file of plain values; dates are texts. Raises ValueError if it is none, or if a key is given twice."""
     import yaml
 
     class UniqueKeys(yaml.SafeLoader):
         """Loads plain values and raises a YAMLError for a key that is given twice: the first value would be ignored."""
+
+        yaml_implicit_resolvers: ClassVar[dict[str, Any]] = {  # without dates, which names may look like
+            first: [(tag, pattern) for tag, pattern in resolvers if not tag.endswith(":timestamp")]
+            for first, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()
+        }
 
         def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
             keys = [key.value for key, _ in node.value if isinstance(key.value, str) and key.value != "<<"]

@@ -157,6 +157,10 @@ class WorkerPool:
         self._executor = None
 
     def _killed(self, problem: str) -> WorkerError:
+        script = getattr(sys.modules["__main__"], "__file__", None)
+        if script is not None and "__main__" not in Path(script).read_text(errors="replace"):
+            fix = 'Put what the script does under `if __name__ == "__main__":`, or use one worker.'
+            return WorkerError("worker processes import this script, which starts them again", path=script, fix=fix)
         fix = "Use fewer workers (--label.workers, or --workers) and run again; finished work is kept."
         return WorkerError(f"{problem}, probably for lack of memory", value=f"{self.workers} workers", fix=fix)
 

@@ -46,7 +46,7 @@ class OcclusionConfig:
         max_depth_m: range of the depth images.
 
     Attributes:
-        margin_m: a surface this close in front of a landmark is the landmark's own: triangulated points are a few
+        margin_m: a surface this close in front of a landmark is the surface that the landmark is on: triangulated points are a few
             centimetres off it.
     """
 

@@ -264,7 +264,7 @@ class ListedViews:
 
 
 def compile_kernels(device: str) -> None:
-    """Compile the kernels that scoring candidates places launches, or load them from Warp's cache.
+    """Compile the kernels that scoring candidate views launches, or load them from Warp's cache.
 
     Compiling takes seconds of one core, once on a machine; other threads can work meanwhile. One of them only may load
     kernels at a time, so this has to end before a `FrustumLister` is made. The device is Warp's, of `start_warp`.

@@ -45,14 +45,14 @@ def may_be_near_hull(directions: Float, lengths: Float, margin: float) -> NDArra
 def _least_lengths(hull: ConvexHull, size: int) -> Float:
     """Length (size^2,) that the hull reaches in all directions of each cell; 0 where it may not.
 
-    The hull holds the points where the cell's corners leave it, and so all their mixes, in which every direction of the
+    The hull holds the points where the cell's corners leave it, and so their convex combinations, in which every direction of the
     cell meets it. If these points are h or more from the origin, and their directions at most an angle a apart, mixes
     w have a squared length of at least h^2 times the sum of w_i w_j cos(a), which is h^2 cos(a).
     """
     edge = np.arange(size + 1) / size * 2 - 1
     corners = octahedral_directions(edge[None, :], edge[:, None])
     corners /= np.linalg.norm(corners, axis=-1, keepdims=True)
-    lengths = _lengths_for_sure(hull, corners.reshape(-1, 3)).reshape(size + 1, size + 1)
+    lengths = _least_hull_lengths(hull, corners.reshape(-1, 3)).reshape(size + 1, size + 1)
     parts = [(slice(i, i + size), slice(j, j + size)) for i in (0, 1) for j in (0, 1)]
     pairs = [(a, b) for number, a in enumerate(parts) for b in parts[:number]]
     least = np.min([lengths[part] for part in parts], axis=0)
@@ -60,7 +60,7 @@ def _least_lengths(hull: ConvexHull, size: int) -> Float:
     return np.asarray((least * np.sqrt(cosine.clip(0))).reshape(-1))
 
 
-def _lengths_for_sure(hull: ConvexHull, directions: Float) -> Float:
+def _least_hull_lengths(hull: ConvexHull, directions: Float) -> Float:
     """Distances (M,) from the origin at which directions (M, 3) leave the hull; 0 for those that do not point into it.
 
     A direction leaves by a facet if it is a mix, without negative shares, of the directions of the facet's corners.
@@ -140,7 +140,7 @@ class HiddenPointRemoval(OcclusionModel):
     `radius` is R as a multiple of the distance from the location to the farthest landmark, at least 1. A landmark that
     would be free if it were `margin_m` nearer is free: what stands this close in front of it is its own surface, as in
     `MeshOcclusion`. A margin of 0 is the published method, with which a landmark is hidden by a neighbour a millimetre
-    nearer. A location is worked on by each CPU core at a time. A hull takes about 0.4 KB a landmark while it is made. Raises a ConfigError if a value is out of range.
+    nearer. Each CPU core processes one location at a time. A hull takes about 0.4 KB a landmark while it is made. Raises a ConfigError if a value is out of range.
     """
 
     name = "hidden-points"

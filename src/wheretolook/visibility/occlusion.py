@@ -95,6 +95,11 @@ class OcclusionModel(ABC):
     name: str = "custom"  # as in `OcclusionConfig`
     uses_all_cores: bool = False  # `unoccluded` occupies all cores of a CPU by itself
 
+    @classmethod
+    def from_inputs(cls, inputs: OcclusionInputs) -> OcclusionModel:
+        """Make the model that `occlusion_config` of a scene describes."""
+        raise NotImplementedError(f"{cls.__name__} is made by its caller only")
+
     @abstractmethod
     def unoccluded(self, locations: Float, points: Float) -> NDArray[np.bool_]:
         """Lines of sight from locations (L, 3) m to points (N, 3) m; (L, N), True where free."""
@@ -150,7 +155,7 @@ class NoOcclusion(OcclusionModel):
 class MeshOcclusion(OcclusionModel):
     """Exact occlusion by the scene's mesh: one ray for each location and landmark.
 
-    A surface `margin_m` in front of a landmark is the landmark's own; ConfigError if that is negative or not finite.
+    A surface `margin_m` in front of a landmark counts as the surface that it is on; ConfigError if that is negative or not finite.
     `two_sided` says whether the backs of triangles are surfaces too, which `FreeSpace.two_sided` finds out. If not, a
     location from which mostly backs are visible is inside geometry.
     """
@@ -307,7 +312,7 @@ class TsdfOcclusion(MeshOcclusion):
     """Occlusion by the surface of a TSDF: one ray for each location and landmark.
 
     Space that no depth image saw occludes nothing. The volume is no longer needed afterwards. A surface up to
-    `margin_m` in front of a landmark is the landmark's own; keep the margin above two voxels. Raises ConfigError if it
+    `margin_m` in front of a landmark counts as the surface that it is on; keep the margin above two voxels. Raises ConfigError if it
     is negative, or there is no such device; SceneError if the depth images show no surface.
     """
 

@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 
 from wheretolook.dataset.config import ALL, threshold_label
-from wheretolook.dataset.viewpoint_table import FIRST, by_first
+from wheretolook.dataset.viewpoint_table import FIRST, with_first_labels
 from wheretolook.evaluation.results import (
     ORACLE,
     PHOTOGRAPHS,
@@ -152,7 +152,7 @@ def _first_table(pooled: pd.DataFrame, key: str, counts: Sequence[int]) -> list[
         return []
     names = {n: f"best {n}" for n in counts}
     rows = pooled.assign(by=pooled["top_n"].map(names))
-    rows = pd.concat([rows, by_first(rows.assign(by=rows["by"] + ", first"))])
+    rows = pd.concat([rows, with_first_labels(rows.assign(by=rows["by"] + ", first"))])
     columns = [f"{name}{suffix}" for name in names.values() for suffix in ("", ", first")]
     about = (
         f"Share in % of the chosen viewpoints that localize within {threshold_label(key)} by the best of several "

@@ -128,7 +128,6 @@ SUPERPOINT = DescriptorKind("superpoint", 256, "float16", min_similarity=0.755)
 ALIKED_N32 = DescriptorKind("aliked-n32", 128, "float16", min_similarity=0.8, colmap_type=2)
 LOMA_B = DescriptorKind("loma-b", 256, "float16", min_similarity=0.85, colmap_type=3)
 LOMA_B128 = DescriptorKind("loma-b128", 128, "float16", min_similarity=0.85, colmap_type=4)
-KINDS = {kind.name: kind for kind in (SIFT, ALIKED, DISK, XFEAT, SUPERPOINT, ALIKED_N32, LOMA_B, LOMA_B128)}
 
 EXTRACTORS = {
     "opencv": Extractor("opencv", SIFT, "sift:OpenCvSift"),
@@ -164,7 +163,11 @@ EXTRACTORS = {
         lightglue="xfeat",
     ),
     "superpoint": Extractor("superpoint", SUPERPOINT, lightglue="superpoint"),
+    "aliked-n32": Extractor("aliked-n32", ALIKED_N32),
+    "loma-b": Extractor("loma-b", LOMA_B),
+    "loma-b128": Extractor("loma-b128", LOMA_B128),
 }
+KINDS = {extractor.descriptors.name: extractor.descriptors for extractor in EXTRACTORS.values()}
 
 
 def runnable_extractors() -> tuple[str, ...]:

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from wheretolook.features.extractor import KINDS, SIFT, DescriptorKind, Stored, unit_descriptors
+from wheretolook.features.extractor import KINDS, SIFT, SUPERPOINT, XFEAT, DescriptorKind, Stored, unit_descriptors
 from wheretolook.mapping.colmap_model import ModelArrays
 from wheretolook.utils.errors import MapError, MapWarning
 from wheretolook.utils.files import check_file, max_expanded_bytes
@@ -161,17 +161,15 @@ def weights_in_name(path: Path | str) -> str:
 
 
 def _kind_by_columns(named: DescriptorKind | None, columns: int) -> DescriptorKind | None:
-    """The kind of learned descriptors: the named one, or the only one of this dimension; else None.
+    """The kind of learned descriptors: the named one, or hloc's only one of this dimension; else None.
 
     Raises ValueError if the named one has another dimension.
     """
     if named is not None and named.dimension != columns:
         raise ValueError(f"descriptors of {named.name} have {named.dimension} numbers, not {columns}")
-    kinds = [kind for kind in KINDS.values() if not kind.in_bytes and kind.dimension == columns]
-    if named in kinds:
-        return named
-    kinds = [kind for kind in kinds if kind.colmap_type < 2]  # databases state the others' types
-    return kinds[0] if len(kinds) == 1 else None
+    if named is not None:
+        return None if named.in_bytes else named
+    return next((kind for kind in (XFEAT, SUPERPOINT) if kind.dimension == columns), None)
 
 
 @contextmanager
@@ -224,7 +222,9 @@ def _kind_in_table(database: sqlite3.Connection) -> DescriptorKind | None:
                 raise ValueError(f"{name} is not a plain table")
             if str(name).lower() == _KIND_TABLE:
                 row = database.execute(f"SELECT name FROM {_KIND_TABLE}").fetchone()
-                named = KINDS.get(str(row["name"])) if row else None
+                if row and row["name"] not in KINDS:
+                    raise ValueError(f"no extractor here has descriptors named {row['name']!r}")
+                named = KINDS[row["name"]] if row else None
     return named
 
 

@@ -159,6 +159,7 @@ def test_an_error_in_a_file_names_the_file(text, tmp_path, capsys):
         (["mapp"], "map"),
         (["map", "--n_images=3"], "--mapping.n_images"),
         (["plan", "--metod", "set"], "--method"),
+        (["select", "--top", "3"], "--n"),
         (["map", "--map.n_images", "3"], "--mapping.n_images"),  # the group's former name
         (["map", "--config", str(CONFIGS / "demo.yml")], "configs/demo.yaml"),
     ],

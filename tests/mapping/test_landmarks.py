@@ -11,6 +11,7 @@ from colmap_models import camera, model_of
 from wheretolook.features.extractor import quantize_descriptors, unit_descriptors
 from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.mapping.landmarks import Landmarks, load_colmap_landmarks, max_cosine_to_other
+from wheretolook.mapping.map import Map
 from wheretolook.utils.errors import MapError, MapWarning
 
 # Three cameras on a line, 2 m apart, that look along +y; two intrinsics. Points in front of them.
@@ -106,6 +107,20 @@ def test_descriptors_are_means_over_the_track(tmp_path, model_dir):
     unit = np.array(expected) / np.linalg.norm(expected, axis=1, keepdims=True)
     cosine = unit @ unit.T - 2 * np.eye(3)
     assert_allclose(landmarks.ambiguity, cosine.max(1), atol=1e-6)
+
+
+@pytest.mark.filterwarnings("ignore::wheretolook.utils.errors.MapWarning")
+def test_sift_in_a_database_above_the_model_is_used(tmp_path, model_dir):
+    model, keypoints = hand_written_model()
+    descriptors = random_descriptors([len(k) for k in keypoints])
+    database = write_database(tmp_path / "database.db", model, keypoints, descriptors)
+    assert Map.open(model_dir).landmarks.features == "sift"
+    database.unlink()
+    write_database(database, model, [k[:2] for k in keypoints], [d[:2] for d in descriptors])  # of another model
+    with pytest.warns(MapWarning, match="disagree on the number"):
+        assert Map.open(model_dir).landmarks.features == ""
+    with pytest.raises(MapError):
+        Map.open(model_dir, database)
 
 
 @pytest.mark.parametrize("n", [2, 500, 3001])

@@ -7,11 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+import pycolmap
 import pytest
 from matplotlib.quiver import Quiver
 
 import wheretolook
-from selection.room import POINTS, WEIGHTS
+from selection.room import POINTS, WEIGHTS, write_room
 from wheretolook.cli import main
 from wheretolook.utils.errors import MapWarning
 
@@ -50,6 +51,34 @@ def test_views_and_scores_of_poses(sparse, at, capsys):
     assert pd.read_csv("scores.csv")["pitch_deg"].tolist() == [0] * 4
     assert main(["score", "--poses", "robot.tum", "--frame", "camera", "--out", "scores.csv", *given]) == 0
     assert pd.read_csv("scores.csv")["pitch_deg"].tolist() == [90] * 4
+
+
+def test_images_of_several_cameras_are_scored_for_their_own(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    model = pycolmap.Reconstruction(write_room(tmp_path / "sparse"))
+    wide = pycolmap.Camera(model="SIMPLE_PINHOLE", width=640, height=480, params=[200, 320, 240], camera_id=2)
+    model.add_camera_with_trivial_rig(wide)
+    first, *_, last = sorted(model.images)
+    (tmp_path / "two").mkdir()
+    model.write_text(str(tmp_path / "two"))
+    text = (tmp_path / "two" / "images.txt").read_text()
+    given = ["--device", "cpu", "--weights", str(WEIGHTS)]
+    name = model.images[last].name
+    (tmp_path / "two" / "images.txt").write_text(text.replace(f" 1 {name}", f" 2 {name}"))
+    for path in ("rigs.txt", "frames.txt"):
+        (tmp_path / "two" / path).unlink(missing_ok=True)
+    assert main(["score", "--map", "two", "--scale", "1", "--poses", "two", "--out", "own.csv", *given]) == 0
+    own = pd.read_csv("own.csv").set_index("waypoint")
+    assert own["camera_id"].value_counts().to_dict() == {1: 11, 2: 1}
+    for number, image in ((1, model.images[first].name), (2, name)):
+        options = ["--camera-id", str(number), "--out", "one.csv", *given]
+        assert main(["score", "--map", "two", "--scale", "1", "--poses", "two/images.txt", *options]) == 0
+        one = pd.read_csv("one.csv").set_index("waypoint")
+        assert one["score"][image] == pytest.approx(own["score"][image], abs=1e-6)
+    assert one["score"][model.images[first].name] != pytest.approx(own["score"][model.images[first].name], abs=1e-6)
+    Path("far.txt").write_text("elsewhere.jpg 1 0 0 0 -2 -2 -1.5\n")
+    assert main(["score", "--map", "two", "--scale", "1", "--poses", "far.txt", "--out", "s.csv", *given]) == 2
+    assert "2 cameras" in capsys.readouterr().err
 
 
 def test_a_floor_plan(sparse, at, look):

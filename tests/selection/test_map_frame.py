@@ -14,7 +14,7 @@ from wheretolook.mapping.config import FrameOptions
 from wheretolook.mapping.georeference import DEPTH_M, median_depths
 from wheretolook.mapping.map_frame import find_frame
 from wheretolook.select.where_to_look import WhereToLook
-from wheretolook.utils.errors import ConfigError, MapError, MapWarning
+from wheretolook.utils.errors import ConfigError, MapError, MapWarning, TableError
 
 Y_DOWN = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # from z up to y down
 
@@ -107,7 +107,7 @@ def test_the_direction_up(sparse, tmp_path):
         ({"distance": ("000.jpg", "000.jpg", 2.0)}, ConfigError),
         ({"distance": ("000.jpg", "001.jpg", -2.0)}, ConfigError),
         ({"distance": ("000.jpg", "001.jpg")}, ConfigError),
-        ({"positions": Path("nothing.csv")}, ConfigError), ({"up": "level", "positions": Path("nothing.csv")}, ConfigError),
+        ({"positions": Path("nothing.csv")}, TableError), ({"up": "level", "positions": Path("nothing.csv")}, ConfigError),
         ({"up": "w"}, ConfigError), ({"up": (0, 0, 0)}, ConfigError), ({"up": "0,0,0"}, ConfigError),
         ({"up": "1,2"}, ConfigError), *(({"up": up}, MapError) for up in ("y", "x", "0,0,-1")),
     ],

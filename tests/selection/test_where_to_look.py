@@ -20,7 +20,7 @@ from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.scenes.loading import save_glb
 from wheretolook.select.waypoints import SelectionRequest, read_waypoints
 from wheretolook.select.where_to_look import WhereToLook
-from wheretolook.utils.errors import ConfigError, MapError, SceneError, TableError, WeightsError
+from wheretolook.utils.errors import ConfigError, MapError, MapWarning, SceneError, TableError, WeightsError
 from wheretolook.visibility.hidden_points import HiddenPointRemoval
 
 AXES = direction_lattice(60)
@@ -234,7 +234,7 @@ def test_a_sequence_stops_where_one_look_will_not_do(look, tmp_path):
     "options",
     [
         {"n": 0}, {"looks": 0}, {"n": 2, "looks": 2}, {"n": 2, "max_turn_deg": 30}, {"looks": 2, "max_turn_deg": 30},
-        {"max_total_turn_deg": 30},
+        {"max_total_turn_deg": 30}, {"sigma_m": 1e300}, {"yaw_sigma_deg": 1e300},
         {"pitch_deg": (30, -30)}, {"pitch_deg": 10}, {"pitch_deg": (-100, 0)}, {"pitch_deg": (30, np.nan)},
         {"pitch_deg": (-0.5, 0.5)},  # radians
         {"pan_deg": (1, 2, 3)}, {"pan_deg": (30, -30)}, {"pan_deg": (-190, 200)},
@@ -278,6 +278,29 @@ def test_limits_on_pan_are_relative_to_the_heading(look, tmp_path):
             look.best(POINTS, pan_deg=(-20, 60), **options)
     with pytest.raises(ConfigError):
         look.best(POINTS, heading_deg=heading, pan_deg=(0, 0.01))
+
+
+def test_unknown_options_and_names_of_files_are_rejected(look, sparse, tmp_path):
+    with pytest.raises(ConfigError, match="heading_deg"):
+        look.best(POINTS, heading=[0, 0, 0, 0])
+    with pytest.raises(ConfigError, match="positions"):
+        WhereToLook.from_colmap(sparse, position="k.csv")
+    with pytest.raises(ConfigError, match="NUL"):
+        look.best(POINTS).save(tmp_path / "a\0b.csv")
+
+
+def test_positions_as_text(sparse, tmp_path):
+    model = pycolmap.Reconstruction(sparse)
+    rows = [f"{image.name} {' '.join(map(str, 2 * image.projection_center()))}" for image in model.images.values()]
+    (tmp_path / "k.txt").write_text("\n".join(rows))
+    (tmp_path / "own").mkdir()
+    model.write_binary(str(tmp_path / "own"))
+    look = WhereToLook.from_colmap(
+        tmp_path / "own", weights=WEIGHTS, positions=str(tmp_path / "k.txt"), occlusion="none", device="cpu"
+    )
+    assert look.frame.world_from_map.scale == pytest.approx(2)
+    with pytest.warns(MapWarning, match=r"accuracy of 50 m exceeds"):
+        look.at_accuracy((50, 2))
 
 
 def test_best_views_apart(look):

@@ -42,7 +42,7 @@ class SelectorOptions(CameraOptions, ScorerOptions, FrameOptions):
         depth: folder of depth images, named like the map's images.
         depth_scale: units of integer depth images in a metre.
         database: COLMAP's database.db or hloc's feats-*.h5, whose descriptors show which landmarks look alike; by default
-            hloc's near the model, or a database near it of other features than SIFT.
+            hloc's near the model, or a database near it; of SIFT only for up to 30,000 points.
         max_error: leave out landmarks with a larger mean reprojection error, in pixels.
         device: where to compute: auto, cpu, cuda, or cuda:<index>.
         frame: whose orientations a trajectory or table holds: base (x forward, z up) or camera (z forward). By default
@@ -81,8 +81,8 @@ class SelectorOptions(CameraOptions, ScorerOptions, FrameOptions):
             raise ConfigError("the camera is described in several ways", value=self.fov, fix="Give one of them.")
         return PinholeCamera.of_field_of_view(self.fov, *parse_size(self.size or "640x480"))
 
-    def open_map(self, **directions: Any) -> WhereToLook:
-        """Open the map; `directions` are options of `WhereToLook.from_colmap`."""
+    def open_map(self, **options: Any) -> WhereToLook:
+        """Open the map; `options` are further ones of `WhereToLook.from_colmap`."""
         from wheretolook.utils.warp import start_warp
         from wheretolook.visibility.counting import compile_kernels
 
@@ -96,7 +96,6 @@ class SelectorOptions(CameraOptions, ScorerOptions, FrameOptions):
                 self.map,
                 weights=self.weights,
                 method=self.method,
-                camera=self.named_camera(),
                 mesh=self.mesh,
                 mesh_up=self.mesh_up,
                 depth=self.depth,
@@ -106,8 +105,7 @@ class SelectorOptions(CameraOptions, ScorerOptions, FrameOptions):
                 max_reprojection_error_px=self.max_error,
                 device=device,
                 anywhere=self.anywhere,
-                **vars(self.frame_options()),
-                **directions,
+                **{"camera": self.named_camera(), **vars(self.frame_options()), **options},
             )
             compiled.result()
         return selector if self.accuracy is None else selector.at_accuracy(self.accuracy)
@@ -125,7 +123,8 @@ def finish(command: SelectorOptions, selector: WhereToLook, views: Views, given:
     localization_map = selector.localization_map
     if views.read_as is not None:
         print(f"{locations} read as {views.read_as[0]}")
-    print(f"{selector.frame.describe()}; camera: {describe_camera(localization_map.camera)}")
+    camera = "that of each image" if views.camera is None else describe_camera(views.camera)
+    print(f"{selector.frame.describe()}; camera: {camera}")
     n_used = len({*views.waypoint.tolist()})
     skipped = f", {given - n_used} left out" if n_used < given else ""
     features = localization_map.landmarks.features or "no descriptors"
@@ -245,7 +244,8 @@ class Score(SelectorOptions):
       COLMAP       images.txt, images.bin or the folder of a model, world-to-camera
       hloc         results "name qw qx qy qz tx ty tz", world-to-camera
 
-    The file of results has the columns and formats of `wheretolook select`, a row for each pose.
+    The file of results has the columns and formats of `wheretolook select`, a row for each pose. In a map of several
+    cameras, a pose with the name of an image of the map is scored for the camera of that image.
 
     Examples:
       wheretolook score --map sparse/0 --poses trajectory.tum --out scores.csv
@@ -267,7 +267,8 @@ class Score(SelectorOptions):
         """Score the poses, write them to `out` and print a summary."""
         table = read_named_rows(self.poses)
         poses_of_rows(table)  # an error about the file comes before the map is read
-        selector = self.open_map()
+        named = self.named_camera()
+        selector = self.open_map(camera="each" if named is None else named)
         poses = Views.of_rows(table, selector.frame.world_from_map.rotation[2], self.frame)
         read_as = poses.read_as[0]
         if self.frame is None and read_as != table.format:

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Literal, get_args
 
+import numpy as np
+from numpy.typing import ArrayLike
+
 from wheretolook.geometry.lattices import Lattice, ViewLattice
-from wheretolook.utils.errors import ConfigError, check_range, no_option
+from wheretolook.utils.errors import ConfigError, MapWarning, check_range, no_option
 
 RELEASE = "release"  # name of the released dataset
 RELEASE_FILE = "release.json"  # what a release was made from; the file that makes a dataset one
@@ -29,14 +33,20 @@ THRESHOLDS = ((0.05, 0.4), (0.25, 2.0), (0.5, 5.0), (5.0, 10.0))
 ACCURACY: Accuracy = THRESHOLDS[0]
 
 
-def checked_accuracy(accuracy: Sequence[float]) -> Accuracy:
-    """Return limits of the errors in metres and degrees. Raises ConfigError unless they are two positive numbers."""
+def checked_accuracy(accuracy: Sequence[float], distances_m: ArrayLike = ()) -> Accuracy:
+    """Return limits of the errors in metres and degrees. Raises ConfigError unless they are two positive numbers.
+
+    A `MapWarning` reports a limit above half the median of the landmarks' distances from the mapping cameras, if given.
+    """
     try:
         limits = tuple(float(limit) for limit in accuracy)
     except (TypeError, ValueError):
         limits = ()
     if len(limits) != 2 or not all(limit > 0 for limit in limits):
         raise ConfigError("an accuracy has two positive limits", value=accuracy, fix="Give metres,degrees: 0.05,0.4.")
+    if np.size(distances_m) and limits[0] > (depth_m := float(np.median(distances_m))) / 2:
+        text = f"an accuracy of {limits[0]:g} m exceeds half the map's median depth of {depth_m:.2g} m; limits are in metres"
+        warnings.warn(f"{text} and degrees: 5 cm and 0.4 degrees are 0.05,0.4", MapWarning, stacklevel=2)
     return limits
 
 

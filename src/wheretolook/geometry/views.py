@@ -52,6 +52,7 @@ WRITTEN = {
     "n_too_oblique": "",
     "n_repeated": ".0f",
     "in_range": "",
+    "camera_id": "",
 }
 """Columns that tables of views have in this order, if they are known, and how their floats are written."""
 
@@ -70,7 +71,7 @@ class Views:
     """
 
     cam_from_world: Float  # (V, 3, 4) float64
-    camera: Camera | None = None  # of all views
+    camera: Camera | None = None  # of all views; None if they have several
     method: str = ""  # name of the scorer
     frame: Any = None  # `MapFrame` of the map: its unit and direction up, and how they are known
 
@@ -82,6 +83,7 @@ class Views:
     set_score: Column = None  # (V,) probability that all views of the location localize jointly
     expected_inliers: Column = None  # (V,) landmarks expected to be detected; NaN where the method does not predict it
     n_visible: Column = None  # (V,) visible landmarks
+    camera_id: Column = None  # (V,) in the model, where views have several cameras
     in_range: Column = None  # (V,) whether the view is within the training distribution of the scorer
     # (V,) mean errors of a pose at the right place
     expected_error_m: Column = None
@@ -216,7 +218,8 @@ class Views:
             if path.suffix:
                 write_text(path, images)
                 return
-            assert self.camera is not None
+            if self.camera is None:
+                raise ConfigError("a model of views has one camera, and these have several", fix="Write csv or json.")
             write_cameras({1: self.camera}, path / "cameras.txt")
             write_text(path / "images.txt", images)
             write_text(path / "points3D.txt", "# no points: poses of selected views\n")
@@ -278,7 +281,6 @@ def _json_content(views: Views) -> dict[str, Any]:
     columns["quaternion_xyzw"] = views.quaternions_xyzw.tolist()
     columns["cam_from_world"] = views.cam_from_world.tolist()
     world_from_map = views.frame.world_from_map
-    assert views.camera is not None
     return {
         "frames": "x, y, z: camera centre in the map, in its unit; qw, qx, qy, qz: camera-to-world; camera z forward",
         "scale": views.frame.scale.source,
@@ -286,7 +288,7 @@ def _json_content(views: Views) -> dict[str, Any]:
         "up": world_from_map.rotation[2].tolist(),
         "gravity": views.frame.gravity,
         "method": views.method,
-        "camera": views.camera.colmap.record(),
+        "camera": None if views.camera is None else views.camera.colmap.record(),
         "views": [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)],
     }
 

@@ -56,10 +56,13 @@ def find_features(model_dir: Path, reconstruction: Any = None) -> Path | None:
     return next(iter(found), None)
 
 
-def choose_features(model_dir: Path, reconstruction: Any, given: Path | None = None) -> Path | None:
+def choose_features(
+    model_dir: Path, reconstruction: Any, given: Path | None = None, sift_points: int = 0
+) -> Path | None:
     """Choose the features that describe the landmarks of a model: `given` ones, or those next to the model.
 
-    The ambiguity of many landmarks takes minutes, so SIFT in a COLMAP database is used only if given. Features that are
+    The ambiguity of many landmarks takes minutes, so SIFT in a COLMAP database that is not given is used only for models
+    of at most `sift_points` points. Features that are
     used without being given are logged. A `MapWarning` reports features that cannot be used, and a model that seems to
     have other features than SIFT, but none that are found. A given database without descriptors, as hloc writes it,
     counts as none if others are found. Raises MapError if given features are unreadable or of another model.
@@ -68,7 +71,9 @@ def choose_features(model_dir: Path, reconstruction: Any, given: Path | None = N
         return given
     found = find_features(model_dir, reconstruction)
     kind, problem = (None, "") if found is None else _kind_or_problem(found, reconstruction)
-    if found is not None and kind is not None and (kind is not SIFT or found.suffix.lower() in HDF5_SUFFIXES):
+    is_small = reconstruction.num_points3D() <= sift_points
+    is_hdf5 = found is not None and found.suffix.lower() in HDF5_SUFFIXES
+    if found is not None and kind is not None and (kind is not SIFT or is_hdf5 or is_small):
         LOG.info("features: %s (%s)", found, kind.name)
         return found
     if given is None and kind is not None:
@@ -222,11 +227,18 @@ class Map:
         """
         path = Path(path)
         model = read_model(path)
-        database = choose_features(path, model, None if database is None else Path(database))
+        given = None if database is None else Path(database)
+        chosen = choose_features(path, model, given, 30_000)  # a search of seconds
         arrays = model_arrays(model)
         found = find_frame(path, model, frame, depth_scale, arrays)
         arrays = found.of_arrays(arrays)
-        landmarks = load_colmap_landmarks(path, database, max_reprojection_error_px, device, model, arrays=arrays)
+        try:
+            landmarks = load_colmap_landmarks(path, chosen, max_reprojection_error_px, device, model, arrays=arrays)
+        except MapError as error:
+            if chosen is None or error.path is None or Path(error.path) != chosen or given is not None:
+                raise
+            warnings.warn(f"{error}; it is not used", MapWarning, stacklevel=2)
+            landmarks = load_colmap_landmarks(path, None, max_reprojection_error_px, device, model, arrays=arrays)
         found.warn(path, landmarks.mapping_distance_m, arrays.image_poses)
         return cls._of_model(path, model, arrays, landmarks, found)
 

@@ -211,7 +211,7 @@ class ImageLocalizer:
         names = names or distinct_names([Path(path) for path in paths])
         queries = [self.images.read(image, name, camera) for image, name in zip(given, names, strict=True)]
         near = None if prior is None else PosePrior.of(prior, self.frame.world_from_map)
-        limits = checked_accuracy(accuracy)
+        limits = checked_accuracy(accuracy, self.landmarks.mapping_distance_m)
         rig = self._rigs if len(queries) > 1 else self._localizer.joint
         looks = []
         poses = []

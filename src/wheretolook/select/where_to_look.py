@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import replace
 from functools import cached_property
@@ -30,7 +30,7 @@ from wheretolook.select.selection import explained, reported, select_views
 from wheretolook.select.waypoints import SelectionRequest, Waypoints, grid_waypoints, usable_waypoints
 from wheretolook.space.mapped_space import MappedSpace
 from wheretolook.utils.devices import usable_device
-from wheretolook.utils.errors import ConfigError, PlanningError, check_names
+from wheretolook.utils.errors import ConfigError, MapError, PlanningError, check_names
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -48,13 +48,22 @@ class WhereToLook:
 
     Locations, poses and views are in the map's own frame and unit, `frame`. `scorer` is any method on a localization
     map; `directions` (D, 3) are the optical axes that are scored at each location, in the world (z up); cameras do not
-    roll. `space` is where a camera can be in the world, for grids; None for the space near the mapping cameras.
+    roll. `space` is where a camera can be in the world, for grids; None for the space near the mapping cameras. `build`
+    makes the scorer for another camera.
     """
 
     def __init__(
-        self, scorer: Scorer, directions: ArrayLike | None = None, space: Any = None, files: ColmapFiles | None = None
+        self,
+        scorer: Scorer,
+        directions: ArrayLike | None = None,
+        space: Any = None,
+        files: ColmapFiles | None = None,
+        build: Callable[[LocalizationMap], Scorer] | None = None,
     ) -> None:
         self.scorer = scorer
+        self._build = build
+        self._accuracy: Accuracy | None = None
+        self._camera_of: dict[str, int] = {}  # camera_id by the name of an image, if each has its camera
         self._space = space
         self._files = files
         axes = direction_lattice(500) if directions is None else np.asarray(directions, dtype=np.float64)
@@ -91,7 +100,8 @@ class WhereToLook:
             weights: file or folder of weights; None for the bundled ones.
             method: name of a method, such as "set" or "visible"; "" for that of the weights.
             camera: the camera of the views: a camera, a text such as "PINHOLE,640,480,320,320,320,240", or the
-                camera_id of one of the model. None for the model's own.
+                camera_id of one of the model. None for the model's own; "each" for that of the image of the same name,
+                in `report`.
             fov_deg: instead, a pinhole of that horizontal field of view in degrees, of 640 x 480 px.
             mesh: mesh of the scene in the map's frame, for true occlusion.
             mesh_up: which axis of the mesh's file is the map's z: "x", "y" or "z", with "-" if it points down.
@@ -113,7 +123,8 @@ class WhereToLook:
             ConfigError: no such method, camera, occlusion, lattice or device.
         """
         device = usable_device(device)
-        camera = _described_camera(camera, fov_deg)
+        of_each = camera == "each"
+        camera = _described_camera(None if of_each else camera, fov_deg)
         axes = direction_lattice(directions, lattice)
         check_names("option of the frame", frame, FrameOptions)
         resolve_weights(method, weights)  # so that missing ones are reported before anything is read
@@ -121,11 +132,21 @@ class WhereToLook:
         options = FrameOptions(**frame)
         files = ColmapFiles(Path(path), mesh, depth, depth_scale, database, max_reprojection_error_px, options, mesh_up)
         scene = Scene.of_colmap(files, camera, occlusion, SceneConfig(occlusion_cache_bytes=1 << 30), device)
+        of_each &= fov_deg is None and len({*scene.map.cameras.values()}) > 1
+        if of_each:
+            scene.camera = next(iter(scene.map.cameras.values()))
         here = scene.localization_map
         weights = resolve_weights(method, weights, here.landmarks.features)
-        if not method:
-            return cls(load_scorer(here, weights, anywhere), axes, scene.space, files)
-        return cls(make_scorer(method, here, weights=weights, anywhere=anywhere), axes, scene.space, files)
+
+        def build(localization_map: LocalizationMap) -> Scorer:
+            if not method:
+                return load_scorer(localization_map, weights, anywhere)
+            return make_scorer(method, localization_map, weights=weights, anywhere=anywhere)
+
+        look = cls(build(here), axes, scene.space, files, build)
+        if of_each and (images := scene.map.images) is not None:
+            look._camera_of = dict(zip(images.image_names, images.image_cameras.tolist(), strict=True))
+        return look
 
     @property
     def localization_map(self) -> LocalizationMap:
@@ -215,6 +236,7 @@ class WhereToLook:
         """
         look = copy(self)
         look.scorer = self.scorer.at_accuracy(accuracy)
+        look._accuracy = accuracy
         return look
 
     def score(self, cam_from_world: ArrayLike) -> Float:
@@ -228,13 +250,33 @@ class WhereToLook:
         """Score poses, as `score` takes them, and report each as a view; names count from 0 unless given.
 
         Raises a PoseError as `score`, and a TableError if one is outside the map or inside geometry, unless `skip`
-        leaves those out.
+        leaves those out. Of a map opened for the camera of each image, a MapError if a pose has no image's name.
         """
         poses = rigid_poses(cam_from_world)
         waypoints = Waypoints.of(camera_centers(poses), names)
         rows = np.flatnonzero(usable_waypoints(self.localization_map, waypoints, skip))
-        views = reported(self.scorer, waypoints, rows, self.frame.world_from_map.apply_to_poses(poses[rows]))
-        return explained(self.reasons, views)
+        in_world = self.frame.world_from_map.apply_to_poses(poses)
+        if not self._camera_of:
+            return explained(self.reasons, reported(self.scorer, waypoints, rows, in_world[rows]))
+        camera_ids = np.array([self._camera_of.get(name, -1) for name in waypoints.ids])
+        for row in rows[camera_ids[rows] < 0]:
+            fix = "Name poses like images of the map, or give one camera: --camera-id or --camera, in Python camera."
+            problem = f"the map has {len({*self._camera_of.values()})} cameras, and a pose is of none of its images"
+            raise MapError(problem, path=waypoints.path, value=waypoints.ids[row], fix=fix)
+        parts = []
+        for number in np.unique(camera_ids[rows]).tolist():
+            here = rows[camera_ids[rows] == number]
+            look = self._of_camera(self.localization_map.map.cameras[number])
+            views = explained(look.reasons, reported(look.scorer, waypoints, here, in_world[here]))
+            parts.append(replace(views, camera_id=np.full(len(views), number)))
+        together = replace(Views.concatenate(parts), camera=None)
+        return together[np.argsort(together.waypoint, kind="stable")]
+
+    def _of_camera(self, camera: Camera) -> WhereToLook:
+        """Return the same for another camera."""
+        assert self._build is not None
+        scorer = self._build(self.localization_map.of_camera(camera))
+        return WhereToLook(scorer if self._accuracy is None else scorer.at_accuracy(self._accuracy))
 
     def best(
         self,

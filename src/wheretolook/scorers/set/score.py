@@ -404,7 +404,7 @@ class SetScorer(LandmarkScorer):
     def at_accuracy(self, accuracy: Accuracy) -> Self:
         """See `Scorer.at_accuracy`."""
         scorer = copy(self)
-        scorer.accuracy = checked_accuracy(accuracy)
+        scorer.accuracy = checked_accuracy(accuracy, self.localization_map.landmarks.mapping_distance_m)
         own = scorer.accuracy == self.trained.accuracy
         scorer.name = self.trained.method if own else f"{self.trained.method} {threshold_key(accuracy)}"
         scorer.training_range = self.trained.range_at(scorer.accuracy)

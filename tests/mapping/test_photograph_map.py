@@ -18,18 +18,22 @@ from wheretolook.commands.sample import Sample
 from wheretolook.commands.viewpoint_map import BuildViewpointMap
 from wheretolook.dataset.config import SampleConfig
 from wheretolook.dataset.viewpoint_table import UNLABELLED, poses
+from wheretolook.features.extractor import SIFT
 from wheretolook.geometry.poses import camera_centers
 from wheretolook.mapping import photograph_map as incremental
 from wheretolook.mapping.colmap_model import colmap_poses, model_arrays, read_model
 from wheretolook.mapping.config import FrameOptions, MarkerConfig, PhotographsConfig
 from wheretolook.mapping.georeference import fit_similarity, median_depths
 from wheretolook.mapping.landmarks import Landmarks
+from wheretolook.mapping.map_folder import MapRun
 from wheretolook.mapping.map_frame import read_frame
 from wheretolook.mapping.photograph_map import map_photographs
+from wheretolook.mapping.photographs import PhotographCameras
 from wheretolook.planning.config import ViewpointMapConfig
 from wheretolook.scorers.visible import VisibleScorer
 from wheretolook.space.config import MappedSpaceConfig
 from wheretolook.utils.errors import MapError, SceneError
+from wheretolook.utils.processes import WorkerPool
 
 TRUTH = hand_held_poses()
 CENTERS = camera_centers(TRUTH)
@@ -133,6 +137,35 @@ def test_other_sources_of_scale_reuse_the_mapping(mapped, photographs, tmp_path)
     with pytest.raises(MapError):
         config = config_of(photographs, marker_size_m=0.4, dictionary="DICT_APRILTAG_36H11")
         map_photographs(config, tmp_path / "map", folder / "work", progress=False)
+
+
+def test_a_street_along_the_viewing_direction_is_mapped_by_a_further_mapper(tmp_path):
+    """COLMAP's own starting pairs exclude forward motion."""
+    rng = np.random.default_rng(0)
+    n = 8
+    facades = np.column_stack([rng.choice([-1, 1], 900) * rng.uniform(5, 8, 900), rng.uniform(-6, 1.5, 900)])
+    points = np.column_stack([facades, rng.uniform(3, 48, 900)])
+    words = rng.gamma(0.5, size=(len(points), SIFT.dimension))
+    words /= np.linalg.norm(words, axis=1)[:, None]
+    stored = []
+    for row in range(n):
+        ahead = points[(points[:, 2] - row > 2) & (points[:, 2] - row < 30)] - (0, 0, row)
+        pixels = ahead[:, :2] / ahead[:, 2:] * 1200 + (640, 480)
+        inside = ((pixels > 0) & (pixels < (1280, 960))).all(1)
+        seen = words[(points[:, 2] - row > 2) & (points[:, 2] - row < 30)][inside]
+        stored.append(((pixels[inside] + rng.normal(0, 0.5, (len(seen), 2))).astype(np.float32), SIFT.store(seen)))
+    names = [f"{row}.jpg" for row in range(n)]
+    sizes = np.tile((1280, 960), (n, 1))
+    features = incremental.PhotographFeatures(names, sizes, sizes, stored, [], "street", SIFT)
+    camera = pycolmap.Camera(camera_id=1, model="SIMPLE_PINHOLE", width=1280, height=960, params=(1200, 640, 480))
+    cameras = PhotographCameras([camera], np.zeros(n, np.int64), given=True)
+    with WorkerPool(1) as processes:
+        run = MapRun(PhotographsConfig(tmp_path), processes, progress=False)
+        mapped = incremental.match_and_map(tmp_path, features, cameras, 10, run)
+    assert mapped.mappers["incremental"] < n / 2 and max(mapped.mappers.values()) == mapped.model_sizes[0] == n
+    placed = colmap_poses(tmp_path, mapped.model)
+    steps = np.diff(camera_centers(placed), axis=0)
+    assert_allclose(steps / np.linalg.norm(steps, axis=1).mean(), placed[:-1, 2, :3], atol=0.1)
 
 
 def test_photographs_that_do_not_overlap_are_refused(tmp_path):

@@ -267,6 +267,7 @@ class Localized:
                 "n_rivals": len(self.rivals),
                 "rival_probability": rival,
                 "reason": self.reason,
+                **self.frame.angle_columns,
             }
         )
 
@@ -331,4 +332,4 @@ def figure_of(result: Localized, landmarks: Float) -> Figure:
     off = np.abs(positions - (low + high) / 2).max(axis=1, initial=0)
     drawn = np.flatnonzero((off < (high - low).max()) | (np.arange(len(off)) == 0))  # wrong poses may be far away
     probabilities = np.array([found[row].probability for row in drawn])
-    return localization_figure(images, points, positions[drawn], axes[drawn], probabilities)
+    return localization_figure(images, points, positions[drawn], axes[drawn], probabilities, result.frame)

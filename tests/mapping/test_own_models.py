@@ -154,7 +154,7 @@ def test_a_database_gives_ambiguity_and_is_not_written_to(tmp_path):
     assert database.read_bytes() == before and sorted(path.name for path in tmp_path.iterdir()) == ["db.db", "model"]
 
 
-@pytest.mark.parametrize("change", ["DELETE FROM descriptors", "UPDATE descriptors SET type = 2"])
+@pytest.mark.parametrize("change", ["DELETE FROM descriptors", "UPDATE descriptors SET type = 9"])
 def test_without_sift_descriptors_ambiguity_is_unknown(tmp_path, change):
     model, keypoints = hand_written_model()
     folder = written(model, tmp_path / "model")

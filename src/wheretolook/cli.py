@@ -49,6 +49,12 @@ NUMBERS = re.compile(r"tuple\[(int|float),")
 """Types of several numbers."""
 
 
+def _freeze() -> None:
+    """Omit collections at the exit, which after `import torch` take half a second; without them OMPL reports leaks."""
+    if "ompl" not in sys.modules:
+        gc.freeze()
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line.
 
@@ -60,7 +66,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(MAX_PIXELS))
     os.environ.setdefault("GLOG_logtostderr", "1")  # COLMAP leaves no log files in the folder of temporary files
     collect_less_garbage()
-    atexit.register(gc.freeze)  # collections at the exit after `import torch` would take half a second
+    atexit.register(_freeze)
     given = list(sys.argv[1:] if arguments is None else arguments) or ["--help"]
     debug = "--debug" in given
     if not debug:

@@ -44,6 +44,7 @@ def test_round_trips(tmp_path):
 
 
 FIRST, SECOND = pose_texts(POSES)
+WXYZ = quaternion_from_rotation(invert_poses(POSES)[..., :3])
 MATRICES = [" ".join(map(str, pose.ravel())) for pose in invert_poses(POSES)]
 
 
@@ -57,6 +58,8 @@ MATRICES = [" ".join(map(str, pose.ravel())) for pose in invert_poses(POSES)]
         f"1 {FIRST} 1 a.jpg\n2 3 -1 5 6 7 8 9 -1\n2 {SECOND} 1 b.jpg\n\n",
         "#timestamp tx ty tz qx qy qz qw\n" + tum_text("12", POSES),
         f"{MATRICES[0]}\n{MATRICES[1]}\n",  # KITTI
+        "#timestamp [ns],p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q_RS_w [],q_RS_x [],q_RS_y [],q_RS_z []\n"  # EuRoC
+        + "".join("1,{4},{5},{6},{0},{1},{2},{3}\n".format(*WXYZ[row], *camera_centers(POSES)[row]) for row in (0, 1)),
         f"7 {MATRICES[0]} 0 0 0 1\n8 {MATRICES[1]} 0 0 0 1\n",
     ],
 )

@@ -1,8 +1,10 @@
 """Maps of learned features: from databases of COLMAP 4 and hloc's HDF5, on disk again, and localized against."""
 
 import warnings
+from pathlib import Path
 
 import numpy as np
+import pycolmap
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
@@ -10,7 +12,7 @@ from mapping.test_landmarks import hand_written_model
 from mapping.test_own_models import written
 from wheretolook.features.extractor import KINDS, unit_descriptors
 from wheretolook.mapping.colmap_model import model_arrays
-from wheretolook.mapping.feature_files import read_features
+from wheretolook.mapping.feature_files import kind_in_name, read_features
 from wheretolook.mapping.landmarks import Landmarks, load_colmap_landmarks, read_feature_name
 from wheretolook.mapping.triangulation import fill_database, match_pairs
 from wheretolook.utils.errors import MapError, MapWarning
@@ -96,6 +98,20 @@ def test_a_database_is_read_as_colmap_4_reads_it(tmp_path):
         read = database.read_descriptors(1)
         assert read.type == pycolmap.FeatureExtractorType.ALIKED_N16ROT
         assert_array_equal(read.to_float().data, stored[0].astype(np.float32))
+
+
+def test_types_are_numbered_as_by_colmap():
+    types = {"SIFT": "sift", "ALIKED_N16ROT": "aliked", "ALIKED_N32": "aliked-n32"}
+    types |= {"LOMA_B": "loma-b", "LOMA_B128": "loma-b128"}
+    for name, kind in types.items():
+        if known := pycolmap.FeatureExtractorType.__members__.get(name):  # from 4.2 on
+            assert KINDS[kind].colmap_type == int(known)
+    for name, kind in (
+        ("feats-aliked-n32", "aliked-n32"),
+        ("feats-aliked-n16", "aliked"),
+        ("x_loma_b128_n2", "loma-b128"),
+    ):
+        assert kind_in_name(Path(f"{name}.h5")) is KINDS[kind]
 
 
 def test_the_number_of_columns_decides_the_kind_where_nothing_states_it(tmp_path):

@@ -14,6 +14,7 @@ from mapping.test_landmarks import hand_written_model, random_descriptors, write
 from synthetic_dataset import CAMERA, make_mapping_poses, make_scene
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import camera_centers, poses_looking_along
+from wheretolook.geometry.similarity import Similarity
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.colmap_model import load_mapping_poses, model_arrays, read_model, save_mapping_poses
 from wheretolook.mapping.config import place_name
@@ -153,7 +154,7 @@ def test_a_database_gives_ambiguity_and_is_not_written_to(tmp_path):
     assert database.read_bytes() == before and sorted(path.name for path in tmp_path.iterdir()) == ["db.db", "model"]
 
 
-@pytest.mark.parametrize("change", ["DELETE FROM descriptors", "UPDATE descriptors SET type = 2"])
+@pytest.mark.parametrize("change", ["DELETE FROM descriptors", "UPDATE descriptors SET type = 9"])
 def test_without_sift_descriptors_ambiguity_is_unknown(tmp_path, change):
     model, keypoints = hand_written_model()
     folder = written(model, tmp_path / "model")
@@ -193,6 +194,11 @@ def test_scale_and_axes_are_doubted_where_they_are_implausible():
     assert up_axis_warning(poses) == ""
     for turn in ([[1, 0, 0], [0, 0, -1], [0, 1, 0]], np.diag([1, -1, -1])):
         assert up_axis_warning(np.concatenate([poses[:, :, :3] @ np.array(turn, float).T, poses[:, :, 3:]], axis=2))
+    # a user who copies the direction from the warning states it in the map's own frame
+    turned = Similarity(rotation=np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]))
+    assert "(-0.01 0.00 1.00), 90 degrees from (0.00 1.00 0.00)" in up_axis_warning(
+        turned.apply_to_poses(poses), turned
+    )
     above = np.stack(np.meshgrid(np.arange(5.0), np.arange(5.0), [30.0]), -1).reshape(-1, 3)
     assert up_axis_warning(poses_looking_along(above, np.tile([1e-3, 0, -1.0], (25, 1)))) == ""  # looking down
 

@@ -287,15 +287,21 @@ def test_damaged_folders_are_rejected_by_file(damage, folder, tmp_path):
 
 def test_devices_and_bombs_are_rejected(folder, tmp_path, monkeypatch):
     copy = shutil.copytree(folder, tmp_path / "copy")
-    monkeypatch.setattr("wheretolook.robot.wheretolook_robot.FREE_BYTES", 1000)
     with np.load(copy / "landmarks.npz") as stored:
-        np.savez_compressed(copy / "landmarks.npz", **{**stored, "places": np.zeros((200_000, 3))})
-    about = json.loads((copy / "robot.json").read_text())
-    about["files"]["landmarks.npz"] = file_digest(copy / "landmarks.npz")
-    del about["sha256"]
-    (copy / "robot.json").write_text(json.dumps(about | {"sha256": description_digest(about)}))
-    with pytest.raises(ValueError, match="would expand"):
-        RobotScorer(copy)
+        arrays = dict(stored)
+    changes = {
+        "uint64": {"unoccluded": arrays["unoccluded"].astype(np.uint64)},
+        "would expand": {"places": np.zeros((200_000, 3))},
+    }
+    monkeypatch.setattr("wheretolook.robot.wheretolook_robot.FREE_BYTES", 100_000)
+    for problem, change in changes.items():
+        np.savez_compressed(copy / "landmarks.npz", **(arrays | change))
+        about = json.loads((copy / "robot.json").read_text())
+        about["files"]["landmarks.npz"] = file_digest(copy / "landmarks.npz")
+        del about["sha256"]
+        (copy / "robot.json").write_text(json.dumps(about | {"sha256": description_digest(about)}))
+        with pytest.raises(ValueError, match=problem):
+            RobotScorer(copy)
     for name in ("landmarks.npz", "robot.json"):
         (copy / name).unlink()
         os.mkfifo(copy / name)

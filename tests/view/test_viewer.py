@@ -204,3 +204,14 @@ def test_a_port_in_use(viewer):
 )  # fmt: skip
 def test_invalid_options(options):
     assert main(["view", *options.split(), *([] if "--port" in options else ["--port", "0"])]) == 2
+
+
+def test_lines_far_from_the_origin_keep_their_shape(viewer):
+    """In single precision, coordinates of UTM are coarse to half a metre."""
+    far = np.array([431_207.125, 5_412_345.5, 312.0])
+    lines = far + np.random.default_rng(0).uniform(-1, 1, (20, 2, 3))
+    with connect(viewer) as client:
+        session = join(viewer, client)
+        session.add_lines("/far", lines, (0, 0, 0), 1.0)
+        handle = session.scene.get_handle_by_name("/far")
+    np.testing.assert_allclose(np.float32(handle.points) + np.asarray(handle.position), lines, atol=1e-4)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
@@ -89,9 +89,16 @@ class Plan(SceneOrMapOptions):
         # another plan may be writing its path into the same folder
         with hold(folder.with_name(f".{folder.name}.lock"), "plan", wait_s=120.0):
             written = []
+            to_map = scene.frame.world_from_map.inverse
+            drawn = {
+                name: replace(along, cam_from_world=to_map.apply_to_poses(along.cam_from_world), frame=scene.frame)
+                for name, along in views.items()
+            }
             for report in reports("plan"):
-                written += report(views, scene.landmarks.points, f"{scene.name}, {method}", folder, config.film)
-            table = _table(path, scene.frame.world_from_map.inverse, stopping=config.stops.looks > 1)
+                written += report(
+                    drawn, to_map.apply(scene.landmarks.points), f"{scene.name}, {method}", folder, config.film
+                )
+            table = _table(path, to_map, stopping=config.stops.looks > 1)
             write_text(folder / "path.csv", table.to_csv(index=False, lineterminator="\n"))
             if config.rerun:
                 _record(views[method], scene.landmarks.points, folder / "path.rrd")

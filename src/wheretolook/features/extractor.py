@@ -124,6 +124,10 @@ DISK = DescriptorKind("disk", 128, "float16", min_similarity=0.8)
 XFEAT = DescriptorKind("xfeat", 64, "float16", min_similarity=0.82)
 # hloc's "NN-superpoint" matches up to a distance of 0.7 between unit descriptors: 1 - 0.7^2 / 2
 SUPERPOINT = DescriptorKind("superpoint", 256, "float16", min_similarity=0.755)
+# ALIKED of another network, and LoMa's descriptors by DeDoDe (Nordström et al. 2026), matched as COLMAP 4.2 does
+ALIKED_N32 = DescriptorKind("aliked-n32", 128, "float16", min_similarity=0.8, colmap_type=2)
+LOMA_B = DescriptorKind("loma-b", 256, "float16", min_similarity=0.85, colmap_type=3)
+LOMA_B128 = DescriptorKind("loma-b128", 128, "float16", min_similarity=0.85, colmap_type=4)
 
 EXTRACTORS = {
     "opencv": Extractor("opencv", SIFT, "sift:OpenCvSift"),
@@ -159,6 +163,9 @@ EXTRACTORS = {
         lightglue="xfeat",
     ),
     "superpoint": Extractor("superpoint", SUPERPOINT, lightglue="superpoint"),
+    "aliked-n32": Extractor("aliked-n32", ALIKED_N32),
+    "loma-b": Extractor("loma-b", LOMA_B),
+    "loma-b128": Extractor("loma-b128", LOMA_B128),
 }
 KINDS = {extractor.descriptors.name: extractor.descriptors for extractor in EXTRACTORS.values()}
 

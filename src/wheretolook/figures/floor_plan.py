@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from wheretolook.figures import KINDS
 from wheretolook.geometry.poses import Float
+from wheretolook.mapping.map_frame import IDENTITY, MapFrame
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.files import write_bytes
 
@@ -88,24 +89,34 @@ def save_figure(figure: Figure, path: Path, note: str = "") -> None:
     write_bytes(path, buffer.getvalue())
 
 
-def floor_plan_figure(landmarks: Float, positions: Float, axes: Float, scores: Float, names: Sequence[str]) -> Figure:
+def floor_plan_figure(
+    landmarks: Float, positions: Float, axes: Float, scores: Float, names: Sequence[str], of: MapFrame = IDENTITY
+) -> Figure:
     """Draw landmarks (N, 3), and views as arrows coloured by score (V,).
 
-    Views have positions (V, 3), unit optical axes (V, 3) and names of their locations; z is up.
+    Views have positions (V, 3), unit optical axes (V, 3) and names of their locations; z is up. The axes are labelled as
+    those `of` the map's own frame, which these are turned from and in whose unit they are.
     """
-    low, high = _extent(landmarks, positions)
+    low, high = plan_extent(landmarks, positions)
     with context(RC):
         width, height = (high - low) / (high - low).max()
         figure = new_figure(2 + 7 * max(width, 0.3), 1 + 7 * max(height, 0.3))
-        draw_floor_plan(figure.add_subplot(), landmarks, positions, axes, scores, names, "score")
+        draw_floor_plan(figure.add_subplot(), landmarks, positions, axes, scores, names, "score", of)
         return figure
 
 
 def draw_floor_plan(
-    plan: Axes, landmarks: Float, positions: Float, axes: Float, scores: Float, names: Sequence[str], label: str
+    plan: Axes,
+    landmarks: Float,
+    positions: Float,
+    axes: Float,
+    scores: Float,
+    names: Sequence[str],
+    label: str,
+    of: MapFrame = IDENTITY,
 ) -> None:
     """Draw what `floor_plan_figure` takes, with a colour bar of the given label."""
-    low, high = _extent(landmarks, positions)
+    low, high = plan_extent(landmarks, positions)
     inside = landmarks[((landmarks[:, :2] >= low) & (landmarks[:, :2] <= high)).all(axis=1)]
     drawn = inside[:: len(inside) // 30_000 + 1]
     arrows = 0.06 * float(np.linalg.norm(high - low)) * axes[:, :2]
@@ -127,13 +138,31 @@ def draw_floor_plan(
     if len(places) <= 30:  # names of more would hide each other
         for name, place in places.items():
             plan.annotate(name, place, (3, 3), textcoords="offset points", fontsize=8)
-    plan.set(xlabel="x, map unit", ylabel="y, map unit", aspect="equal")
+    plan.set(aspect="equal")
+    label_plan(plan, of, low, float((high - low).max()))
     plan.figure.colorbar(shown, ax=plan, shrink=0.7, label=label)
 
 
-def _extent(landmarks: Float, positions: Float) -> tuple[Float, Float]:
-    """Return the lowest and highest x and y, (2,) each, of the plan."""
-    low, high = np.quantile(landmarks[:, :2], (0.01, 0.99), axis=0)
+def label_plan(plan: Axes, of: MapFrame, corner: Float, size: float) -> None:
+    """Label the axes of a plan; draw those of a map that is turned upright from a corner (2,) of a plan of that size."""
+    if not of.is_turned:
+        plan.set(xlabel=f"x ({of.unit})", ylabel=f"y ({of.unit})")
+        return
+    length = float(f"{size / 4:.0e}")
+    directions = length * of.world_from_map.rotation[:2].T
+    start = corner - directions.min(axis=0)
+    for name, direction in zip("xyz", directions, strict=True):
+        plan.annotate(name, tuple(start), tuple(start + direction), arrowprops={"arrowstyle": "<-", "color": INK})
+    text = f"the map's own axes, {length:g} {of.unit} long; it is turned upright here only"
+    plan.set(xticks=[], yticks=[], xlabel=text)
+
+
+def plan_extent(landmarks: Float, positions: Float) -> tuple[Float, Float]:
+    """Return the lowest and highest x and y, (2,) each, of a plan of positions and of the landmarks that are not far out."""
+    low, first, third, high = np.quantile(landmarks[:, :2], (0.01, 0.25, 0.75, 0.99), axis=0)
+    fence = 3 * (third - first).max()  # beyond it values are far out (Tukey 1977)
+    low = np.maximum(low, first - fence)
+    high = np.minimum(high, third + fence)
     return np.minimum(low, positions[:, :2].min(axis=0)), np.maximum(high, positions[:, :2].max(axis=0))
 
 
@@ -149,7 +178,12 @@ class DrawnImage:
 
 
 def localization_figure(
-    images: Sequence[DrawnImage], landmarks: Float, positions: Float, axes: Float, probabilities: Float
+    images: Sequence[DrawnImage],
+    landmarks: Float,
+    positions: Float,
+    axes: Float,
+    probabilities: Float,
+    of: MapFrame = IDENTITY,
 ) -> Figure:
     """Draw images with their matches, and on a plan of landmarks (N, 3) the pose and its rivals (1 + R, 3), the pose first.
 
@@ -181,5 +215,5 @@ def localization_figure(
         if len(positions):
             names = ["pose", *(f"rival {n}" for n in range(1, len(positions)))]
             plan = figure.add_subplot(grid[:, -1])
-            draw_floor_plan(plan, landmarks, positions, axes, probabilities, names, "probability")
+            draw_floor_plan(plan, landmarks, positions, axes, probabilities, names, "probability", of)
         return figure

@@ -185,6 +185,8 @@ def read_named_rows(path: str | Path) -> NamedRows:
 def _names_of(cells: Sequence[str]) -> tuple[str, ...]:
     """Return names of columns in lower case, without metres as their unit, and synonyms by their usual names."""
     plain = [re.sub(r"\s*[\[(](m|s|)[\])]$", "", cell.strip("\"' ").lower()) for cell in cells]
+    for prefix, kind in (("", "(p|pos|(.*[.])?position)"), ("q", "(q|quat|(.*[.])?orientation)")):  # EuRoC's, ROS's
+        plain = [re.sub(rf"^{kind}[._](.*_)?([wxyz])$", rf"{prefix}\4", name) for name in plain]
     return tuple(name if _SYNONYMS.get(name) in plain else _SYNONYMS.get(name, name) for name in plain)
 
 

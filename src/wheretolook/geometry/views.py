@@ -255,6 +255,7 @@ def _table(views: Views) -> dict[str, list[Any]]:
     columns: dict[str, Any] = {"waypoint": views.waypoint_id, "rank": views.rank, "x": x, "y": y, "z": z}
     columns |= {"yaw_deg": views.yaw_deg, "pitch_deg": views.pitch_deg}
     columns |= {name: values for name in WRITTEN if (values := getattr(views, name)) is not None}
+    columns |= {name: [text] * len(views) for name, text in views.frame.angle_columns.items()}
     columns["scale"] = [views.frame.scale.source] * len(views)
     if views.read_as is not None:
         columns["read_as"] = views.read_as
@@ -286,6 +287,7 @@ def _json_content(views: Views) -> dict[str, Any]:
         "scale": views.frame.scale.source,
         "metres_per_unit": world_from_map.scale,
         "up": world_from_map.rotation[2].tolist(),
+        "yaw_zero": world_from_map.rotation[0].tolist(),
         "gravity": views.frame.gravity,
         "method": views.method,
         "camera": None if views.camera is None else views.camera.colmap.record(),

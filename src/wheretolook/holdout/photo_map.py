@@ -177,16 +177,6 @@ class PhotographedMap:
         # 0.5 m in a room of 5 m, within which mostly the direction decides
         return 0.1 * (DEPTH_M if not self.is_metric else float(np.nanmedian(self.depth_m)))
 
-    @property
-    def is_turned(self) -> bool:
-        """Whether the model was turned upright."""
-        return not np.array_equal(self.from_model.rotation, np.eye(3))
-
-    @property
-    def unit(self) -> str:
-        """Name of the unit of the model's own frame."""
-        return "m" if self.is_metric and self.from_model.scale == 1 else "map units"
-
 
 def open_map(
     model_dir: Path, features: Path, name: str = "", frame: FrameOptions = FrameOptions(), source: Path | None = None

@@ -18,8 +18,7 @@ from scipy.sparse.csgraph import connected_components
 
 from wheretolook.dataset.config import ACCURACY, Accuracy
 from wheretolook.evaluation.statistics import reliability
-from wheretolook.figures.floor_plan import BLUE, INK, RC, VERMILION, new_figure
-from wheretolook.geometry.poses import Float
+from wheretolook.figures.floor_plan import BLUE, INK, RC, VERMILION, label_plan, new_figure
 from wheretolook.holdout.holdout import VIEWS, HoldoutResult, choose_blocks, hold_out_blocks, judged
 from wheretolook.holdout.metrics import measure
 from wheretolook.holdout.photo_map import PhotographedMap
@@ -147,7 +146,7 @@ class CheckReport:
             "model": str(self.source.path),
             "method": self.method,
             "in_metres": self.source.is_metric,
-            "turned_upright": self.source.is_turned,
+            "turned_upright": self.source.frame.is_turned,
             "limits": self.limits(),
             "fov_deg": self.source.fov_deg,
             "says": self.sentence(),
@@ -228,14 +227,16 @@ class CheckReport:
             lines.append(f"views of {source.fov_deg:g} degrees, {source.n_crops} of each photograph")
         if numbers["share_in_range"] < 1:
             lines.append(f"{100 * (1 - numbers['share_in_range']):.0f} % of the views are outside the training range")
-        if source.is_turned:
+        if source.frame.gravity == "levelled" and source.frame.is_turned:
             lines.append("the model was turned upright; --up states another direction, --up z keeps the model's")
         if not source.is_metric:
             lines.extend(source.frame.doubts[:1])
         if not self.parts:
             return [*lines, "no part of the map fails without its neighbours"]
-        lines.append(f"photograph again ({len(self.parts)} parts relocalize badly, {source.unit}):")
-        lines += [f"  {part.number}. {part.describe(source.names, source.unit)}" for part in self.parts[:MAX_PRINTED]]
+        lines.append(f"photograph again ({len(self.parts)} parts relocalize badly, {source.frame.unit}):")
+        lines += [
+            f"  {part.number}. {part.describe(source.names, source.frame.unit)}" for part in self.parts[:MAX_PRINTED]
+        ]
         if len(self.parts) > MAX_PRINTED:
             lines.append(f"  and {len(self.parts) - MAX_PRINTED} more: column part of check.csv")
         return lines
@@ -390,22 +391,9 @@ def _draw_map(axes: Axes, report: CheckReport) -> None:
             arrowprops=style, bbox=box,
         )  # fmt: skip
     axes.set(xlim=(low[0] - margin, high[0] + margin), ylim=(low[1] - margin, high[1] + margin), aspect="equal")
-    if source.is_turned:
-        _draw_own_axes(axes, source.from_model.rotation, low, float(f"{(high - low).max() / 4:.0e}"), source.unit)
-    else:
-        axes.set(xlabel=f"x ({source.unit})", ylabel=f"y ({source.unit})")
+    label_plan(axes, source.frame, low, (high - low).max())
     axes.set_title("from above; photographs held out with their neighbours", pad=24)
     axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=3, handletextpad=0.1, borderaxespad=0.2)
-
-
-def _draw_own_axes(axes: Axes, rotation: Float, corner: Float, length: float, unit: str) -> None:
-    """Draw the axes of a map's own frame, which a rotation (3, 3) turned upright, from a corner (2,) of the drawing."""
-    directions = length * rotation[:2].T
-    start = corner - directions.min(axis=0)
-    for name, direction in zip("xyz", directions, strict=True):
-        axes.annotate(name, tuple(start), tuple(start + direction), arrowprops={"arrowstyle": "<-", "color": INK})
-    text = f"the map's own axes, {length:g} {unit} long; it is turned upright here only"
-    axes.set(xticks=[], yticks=[], xlabel=text)
 
 
 def _draw_calibration(axes: Axes, report: CheckReport) -> None:

@@ -149,9 +149,9 @@ def _check_keypoints(features: _Features, image: Any, path: Path) -> None:
 
 def kind_in_name(path: Path) -> DescriptorKind | None:
     """The kind of descriptors that a file is named after, as hloc names it."""
-    words = re.split(r"[^a-z0-9]+", path.stem.lower())
-    kinds = (kind for name, kind in KINDS.items() if any(word.startswith(name) for word in words))
-    return next(kinds, None)
+    words = "-".join(["", *re.split(r"[^a-z0-9]+", path.stem.lower())])
+    named = [name for name in KINDS if f"-{name}" in words]
+    return KINDS[max(named, key=len)] if named else None
 
 
 def weights_in_name(path: Path | str) -> str:

@@ -159,8 +159,11 @@ def scale_warning(mapping_distance_m: ArrayLike, centers: ArrayLike) -> str:
     return f"the model seems not to be in metres: {lengths}. {fix}"
 
 
-def up_axis_warning(cam_from_world: ArrayLike) -> str:
-    """Message if z seems not to be up in a map, by the poses (M, 3, 4) of its cameras; else ""."""
+def up_axis_warning(cam_from_world: ArrayLike, world_from_map: Similarity = Similarity()) -> str:
+    """Message if z seems not to be up in the world, by the poses (M, 3, 4) of the cameras; else "".
+
+    Directions in it are in the map's own frame, in which `--up` takes them.
+    """
     poses = np.asarray(cam_from_world, dtype=np.float64)
     gravity = estimate_gravity(poses)
     off_deg = float(np.degrees(np.arccos(np.clip(gravity.up[2], -1, 1))))
@@ -170,9 +173,10 @@ def up_axis_warning(cam_from_world: ArrayLike) -> str:
     how = "on their side" if off_deg > 45 else "askew"
     if off_deg > 135:
         how = "upside down"
+    up, given = gravity.up @ world_from_map.rotation, world_from_map.rotation[2]
     return (
-        f"the cameras are {how}: the up direction estimated from their orientations is ({_rounded(gravity.up)}), "
-        f"{off_deg:.0f} degrees from z, which is up here. --up level turns it upright. Ignore this warning if the "
+        f"the cameras are {how}: the up direction estimated from their orientations is ({_rounded(up)}), "
+        f"{off_deg:.0f} degrees from ({_rounded(given)}), which is up here. --up level turns it upright. Ignore this warning if the "
         "cameras were held so"
     )
 
@@ -199,6 +203,22 @@ class MapFrame:
             image_centers=to_world.apply(arrays.image_centers),
         )
 
+    @property
+    def is_turned(self) -> bool:
+        """Whether the axes of the map are not those of the world."""
+        return not np.allclose(self.world_from_map.rotation, np.eye(3), atol=1e-3)
+
+    @property
+    def unit(self) -> str:
+        """Name of the unit of the map's coordinates."""
+        return "m" if self.scale.is_metric and self.world_from_map.scale == 1 else "map units"
+
+    @property
+    def angle_columns(self) -> dict[str, str]:
+        """Directions in the map where pitch_deg is 90 and yaw_deg 0, as columns of tables; none if they are z and x."""
+        rotation = self.world_from_map.rotation
+        return {"up": _rounded(rotation[2], 6), "yaw_zero": _rounded(rotation[0], 6)} if self.is_turned else {}
+
     def record(self) -> dict[str, Any]:
         """Return the frame as JSON values, from which `read_frame` makes it."""
         similarity = self.world_from_map
@@ -223,7 +243,7 @@ class MapFrame:
         Takes the mean distance of each landmark's mapping cameras (N,) m, and the poses (M, 3, 4) of all in the world.
         """
         scale = scale_warning(mapping_distance_m, camera_centers(cam_from_world)) if self.scale.is_metric else ""
-        up = "" if self.gravity == "levelled" else up_axis_warning(cam_from_world)
+        up = "" if self.gravity == "levelled" else up_axis_warning(cam_from_world, self.world_from_map)
         return (*self.doubts, *filter(None, (scale, up)))
 
     @property
@@ -352,8 +372,8 @@ def _upright(
     return "given", rotation
 
 
-def _rounded(direction: Float) -> str:
-    return " ".join(f"{value:.2f}" for value in np.round(direction, 2) + 0.0)  # no -0.00
+def _rounded(direction: Float, digits: int = 2) -> str:
+    return " ".join(f"{value:.{digits}f}" for value in np.round(direction, digits) + 0.0)  # no -0.00
 
 
 IDENTITY = MapFrame()

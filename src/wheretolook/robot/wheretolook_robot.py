@@ -169,6 +169,9 @@ class RobotScorer:
                 if n_bytes > max(FREE_BYTES, 100 * path.stat().st_size):
                     raise ValueError(f"it would expand to {n_bytes:,} bytes")
                 arrays = {name: stored[name] for name in ("points", "directions", "attributes", "places", "unoccluded")}
+                bits = arrays["unoccluded"]
+                if bits.dtype != np.uint8 or bits.shape != (len(arrays["places"]), -(-len(arrays["points"]) // 8)):
+                    raise ValueError(f"unoccluded is {bits.dtype} of shape {bits.shape}")
         except Exception as error:  # a damaged archive raises errors of many kinds
             raise ValueError(f"{path}: the landmarks cannot be used: {error}. Export again.") from error
         self.points: Array = arrays["points"]

@@ -102,7 +102,7 @@ GROUP = "wheretolook.methods"  # entry points of this group are a `Method`, or s
 
 FALLBACK = "bins"  # the method of viewpoint maps where neither a method nor weights are given
 
-SUBSTITUTES = {"disk": "aliked", "xfeat": "aliked", "superpoint": "aliked"}
+SUBSTITUTES = dict.fromkeys(("disk", "xfeat", "superpoint", "aliked-n32", "loma-b", "loma-b128"), "aliked")
 """Features whose weights are better than those by SIFT where a map's own features have none: measured on val scenes by
 DISK and XFeat (docs/features.md), assumed for SuperPoint."""
 

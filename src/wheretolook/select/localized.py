@@ -154,6 +154,7 @@ class Localized:
                 "reason": self.reason,
                 "camera_from": self.cameras_from or "",
                 "focal_px": [camera.colmap.mean_focal_px for camera in self.cameras] or np.nan,
+                **self.frame.angle_columns,
             }
         )
 
@@ -218,4 +219,4 @@ def figure_of(result: Localized, landmarks: Float) -> Figure:
     off = np.abs(positions - (low + high) / 2).max(axis=1, initial=0)
     drawn = np.flatnonzero((off < (high - low).max()) | (np.arange(len(off)) == 0))  # wrong poses may be far away
     probabilities = np.array([found[row].probability for row in drawn])
-    return localization_figure(images, points, positions[drawn], axes[drawn], probabilities)
+    return localization_figure(images, points, positions[drawn], axes[drawn], probabilities, result.frame)

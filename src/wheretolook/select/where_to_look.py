@@ -322,7 +322,7 @@ class WhereToLook:
         frame = self.frame.world_from_map
         landmarks = frame.inverse.apply(self.localization_map.landmarks.points)
         points, positions, axes = (points @ frame.rotation.T for points in (landmarks, views.positions, views.axes))
-        return floor_plan_figure(points, positions, axes, views.score, views.waypoint_id)
+        return floor_plan_figure(points, positions, axes, views.score, views.waypoint_id, self.frame)
 
     @cached_property
     def reasons(self) -> ReasonCounter:

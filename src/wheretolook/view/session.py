@@ -14,6 +14,7 @@ import numpy as np
 
 from wheretolook.dataset.config import THRESHOLDS, threshold_key, threshold_label
 from wheretolook.geometry.poses import Float, quaternion_from_rotation
+from wheretolook.geometry.similarity import local_origin
 from wheretolook.utils.errors import ConfigError, WhereToLookError
 from wheretolook.view import drawing
 from wheretolook.view.state import MAX_VIEWS, ViewState
@@ -354,8 +355,14 @@ class Session:
         )
 
     def add_lines(self, name: str, segments: Float, colors: Any, thickness: float) -> None:
-        """Draw lines between pairs of points (S, 2, 3) m, in one colour or those of their ends (S, 2, 3)."""
-        self.scene.add_line_segments(name, segments, colors, thickness=thickness, thickness_units="screen")
+        """Draw lines between pairs of points (S, 2, 3) m, in one colour or those of their ends (S, 2, 3).
+
+        As for points, coordinates are sent relative to an origin nearby.
+        """
+        origin = local_origin(segments.reshape(-1, 3))
+        self.scene.add_line_segments(
+            name, segments - origin, colors, thickness=thickness, thickness_units="screen", position=origin
+        )
 
     def add_frustum(self, name: str, pose: Float, markers: float, color: tuple[int, int, int], **options: Any) -> None:
         """Draw the frustum of a camera pose (3, 4), `markers` times as large as a marker."""

@@ -92,7 +92,7 @@ def draw_path(views: dict[str, Views], landmarks: Float, title: str, folder: Pat
 
     Args:
         views: the views along each method's path.
-        landmarks: (N, 3) m, of the map.
+        landmarks: (N, 3) of the map, in the frame of the views.
         title: of the picture `path.png`.
         folder: where the files are written.
         film: suffix of a film of the path, gif or mp4; none for no film.

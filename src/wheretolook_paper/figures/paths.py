@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 
 from wheretolook.dataset.config import ALL
 from wheretolook.dataset.layout import Dataset
-from wheretolook.figures.floor_plan import BLUE, GREY, INK, RC, VERMILION, frame, new_figure
+from wheretolook.figures.floor_plan import BLUE, GREY, INK, RC, VERMILION, frame, label_plan, new_figure, plan_extent
 from wheretolook.geometry.poses import Float, poses_looking_along
 from wheretolook.geometry.views import Views
+from wheretolook.mapping.map_frame import IDENTITY
 from wheretolook.planning.view_sequence import lengths_along
 from wheretolook.utils.errors import MissingRunError
 from wheretolook.utils.texts import counted, markdown_table, score_text
@@ -88,7 +89,7 @@ _NUMBER: Style = {"boxstyle": "circle,pad=0.15", "facecolor": PATH, "edgecolor":
 def film_frames(views: Views, landmarks: Float) -> Iterator[Pixels]:
     """Draw one frame (H, W, 3) per view: its image with visible landmarks, the map, and the score along the path.
 
-    `landmarks` (N, 3) m are those of the map; there is at least one view.
+    `landmarks` (N, 3) are those of the map, in the frame of the views; there is at least one view.
     """
     with context(RC):
         for number in range(len(views)):
@@ -103,7 +104,7 @@ def film_frames(views: Views, landmarks: Float) -> Iterator[Pixels]:
 def still_figure(views: Views, landmarks: Float, title: str = "") -> Figure:
     """Draw a path from above, its score, and some evenly spread views of it.
 
-    `landmarks` (N, 3) m are those of the map; there is at least one view.
+    `landmarks` (N, 3) are those of the map, in the frame of the views; there is at least one view.
     """
     own = np.flatnonzero(views.rank == 1)
     shown = own[np.unique(np.linspace(0, len(own) - 1, 5).round().astype(int))].tolist()
@@ -124,7 +125,7 @@ def still_figure(views: Views, landmarks: Float, title: str = "") -> Figure:
 def methods_figure(paths: Mapping[str, Views], landmarks: Float) -> Figure:
     """Draw the paths of several methods side by side from above, with viewing directions (paper, Sec. 4.3).
 
-    `paths` maps the name of each method to the views along its path; `landmarks` (N, 3) m.
+    `paths` maps the name of each method to the views along its path; `landmarks` (N, 3).
     """
     with context(RC):
         figure = new_figure(3.9 * len(paths), 4.2)
@@ -157,11 +158,13 @@ def _views_there(views: Views) -> NDArray[np.int64]:
 
 def draw_path(axes: Axes, views: Views, landmarks: Float, number: int | None = None, shown: Sequence[int] = ()) -> None:
     """Draw landmarks (N, 2 or 3) and path from above, arrows along it or at view `number`, numbers at views `shown`."""
-    positions = views.positions
+    of = views.frame or IDENTITY
+    turn = of.world_from_map.rotation.T
+    positions = views.positions @ turn
+    along_axes = views.axes @ turn
+    landmarks = landmarks @ turn if of.is_turned else landmarks
     xy = positions[:, :2]
-    low, high = np.percentile(landmarks[:, :2], (1, 99), axis=0)
-    low = np.minimum(low, xy.min(0))
-    high = np.maximum(high, xy.max(0))
+    low, high = plan_extent(landmarks, positions)
     axes.scatter(landmarks[:, 0], landmarks[:, 1], s=0.5, color="#9a9a9a", linewidths=0, rasterized=True)
     axes.plot(*xy.T, color=PATH, linewidth=2.2, zorder=3)
     stops = xy[(views.rank == 1) & (_views_there(views) > 1)]
@@ -173,11 +176,11 @@ def draw_path(axes: Axes, views: Views, landmarks: Float, number: int | None = N
         arrows = [number]
         length *= 2
     for at in arrows:
-        axes.annotate("", xy[at] + views.axes[at, :2] * length, xy[at], arrowprops=_ARROW, zorder=4)
+        axes.annotate("", xy[at] + along_axes[at, :2] * length, xy[at], arrowprops=_ARROW, zorder=4)
     for label, at in enumerate(shown, 1):
         axes.annotate(str(label), xy[at], fontsize=9, color="white", ha="center", va="center", bbox=_NUMBER, zorder=5)
     axes.set(xlim=(low[0] - margin, high[0] + margin), ylim=(low[1] - margin, high[1] + margin), aspect="equal")
-    axes.set(xlabel="x (m)", ylabel="y (m)")
+    label_plan(axes, of, low, float((high - low).max()))
 
 
 def _draw_scores(axes: Axes, views: Views, number: int | None, shown: Sequence[int] = ()) -> None:
@@ -202,7 +205,7 @@ def _draw_scores(axes: Axes, views: Views, number: int | None, shown: Sequence[i
     lowest, highest = (finite.min(), finite.max()) if len(finite) else (0.0, 1.0)
     margin = max(0.25 * (highest - lowest), 0.02 * max(1.0, abs(highest)))  # a constant score is in the middle
     axes.set(xlim=(0, max(along[-1], 1e-6)), ylim=(lowest - margin, highest + margin))
-    axes.set(xlabel="along the path (m)", ylabel="score")
+    axes.set(xlabel=f"along the path ({(views.frame or IDENTITY).unit})", ylabel="score")
 
 
 PATHS_CSV = "plan_photographs.csv"

@@ -15,6 +15,7 @@ from wheretolook.geometry.camera import (
     field_of_view_deg,
     only_camera,
     read_cameras,
+    turn_camera,
     write_cameras,
 )
 from wheretolook.mapping.colmap_model import read_model
@@ -140,3 +141,27 @@ def test_the_camera_of_a_map(tmp_path):
         only_camera(cameras_by_id(read_model(tmp_path).cameras, tmp_path), tmp_path)
     with pytest.raises(MapError):
         read_model(tmp_path / "nowhere")
+
+
+TANGENTIAL = (220.0, 225.0, 310.0, 245.0, 0.02, -0.01, 0.003, -0.004)
+
+
+@pytest.mark.parametrize(
+    "camera",
+    [
+        OFF_CENTER,
+        FISHEYE,
+        ColmapCamera("SIMPLE_RADIAL", 640, 480, (500.0, 310.0, 245.0, -0.05)),
+        ColmapCamera("OPENCV", 640, 480, TANGENTIAL),
+        ColmapCamera("FULL_OPENCV", 640, 480, (*TANGENTIAL, 0.001, 0.01, 0.0, 0.0)),
+        ColmapCamera("THIN_PRISM_FISHEYE", 640, 480, (*TANGENTIAL, 0.001, 0.0, 0.002, -0.003)),
+    ],
+)
+def test_a_camera_turned_with_its_image_sees_a_turned_scene(camera):
+    points = np.random.default_rng(0).uniform((-0.4, -0.3, 1), (0.4, 0.3, 2), (20, 3))
+    x, y = camera.colmap.project(points).T
+    turned = turn_camera(camera, 1)  # to the left: the right side is at the top
+    assert (turned.width, turned.height) == (camera.height, camera.width)
+    seen = turned.colmap.project(points @ [[0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    np.testing.assert_allclose(seen, np.column_stack([y, camera.width - x]), rtol=0, atol=1e-6)
+    assert turn_camera(turned, 3) == camera

@@ -20,7 +20,7 @@ from wheretolook.localization.estimation import (
     strongest_rival,
     turn_errors,
 )
-from wheretolook.localization.rig import MAX_NEAREST_RATIO, Candidates, Look, rig_of
+from wheretolook.localization.rig import MAX_NEAREST_RATIO, Candidates, FocalPrior, Look, rig_of
 from wheretolook.localization.rig_localization import JointLocalizer
 from wheretolook.utils.errors import PoseError
 
@@ -350,3 +350,19 @@ def test_a_pose_from_few_matches_becomes_more_accurate():
     assert guided.n_inliers > 10 * alone.n_inliers
     error, error_alone = (pose_error(result.rig_from_world, pose)[0] for result in (guided, alone))
     assert error < 0.3 * error_alone and error < 0.01
+
+
+def test_an_assumed_focal_length_that_a_wall_does_not_determine_makes_the_pose_uncertain():
+    points = a_room(2000)
+    points[:, 0] = 4.0  # a wall, which the camera faces: distance and focal length are exchangeable
+    poses, (look,), _ = looks_from(points, axes=((1, 0, 0),), noise_px=0.5)
+    localizer = JointLocalizer(PoseEstimator(points, LocalizerConfig(method="hypotheses")))
+    known = localizer.localize([look])
+    assert known.deviation[0] < 0.02
+    for ratio in (0.9, 1.0):
+        camera = replace(CAMERA, focal_px=CAMERA.focal_px * ratio)
+        assumed = replace(look, camera=camera, focal=FocalPrior((camera.focal_px,), (0.0,)))
+        found = localizer.localize([assumed])
+        error_m = pose_error(found.rig_from_world, poses[0])[0]
+        assert error_m < 3 * found.deviation[0]
+        assert probabilities(found)[0] < 0.5

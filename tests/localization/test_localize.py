@@ -8,10 +8,12 @@ import numpy as np
 import pandas as pd
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
+from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from localization.rooms import CAMERA
 from wheretolook.cli import main
+from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import pose_error, poses_looking_along
 from wheretolook.geometry.similarity import Similarity
 from wheretolook.geometry.views import Views
@@ -224,6 +226,50 @@ def test_the_probability_is_that_of_the_accuracy(localizer, photos):
     coarse, fine = (localizer.localize(photos / "a.png", accuracy=limits) for limits in ((0.5, 5.0), (0.0005, 0.005)))
     assert coarse.probability > 0.9 and fine.probability < coarse.probability / 2
     assert_array_equal(coarse.cam_from_world, fine.cam_from_world)
+
+
+@pytest.mark.parametrize("focal_px", [130.0, 160.0, 195.0])
+def test_an_assumed_focal_length_is_refined_with_the_pose(room, localizer, focal_px):
+    camera = PinholeCamera(320, 240, focal_px)
+    rgb = WarpRenderer(load_mesh(room.mesh)).render(camera, POSES[:1]).rgb[0]
+    result = localizer.localize(rgb)
+    assert_near(result.cam_from_world, POSES[:1])
+    row = result.table().iloc[0]
+    assert row.camera_from == "assumed: camera 1 of the map" in result.describe()
+    assert row.focal_px == pytest.approx(focal_px, rel=0.01)
+    assert_near(localizer.localize(rgb, camera=camera).cam_from_world, POSES[:1])
+
+
+def test_a_portrait_image_has_the_camera_of_the_map_turned(localizer, photos):
+    for quarters in (1, 3):
+        rgb = np.ascontiguousarray(np.rot90(read_photograph(photos / "a.png"), quarters))
+        result = localizer.localize(rgb)
+        assert (result.cameras[0].width, result.cameras[0].height) == (240, 320)
+        roll = Rotation.from_euler("z", -90 * quarters, degrees=True).as_matrix()
+        assert_near(result.cam_from_world, roll @ POSES[:1])
+
+
+@pytest.mark.parametrize("orientation", [1, 3, 6, 8])
+def test_pixels_are_those_as_stored_whatever_the_exif_orientation(localizer, photos, tmp_path, orientation):
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    exif.get_ifd(0x8769)[0xA405] = 30  # a focal length of 277 px, which contradicts the 160 px of the map
+    Image.fromarray(read_photograph(photos / "a.png")).save(tmp_path / "q.jpg", exif=exif, quality=97)
+    result = localizer.localize(tmp_path / "q.jpg")
+    assert_near(result.cam_from_world, POSES[:1])
+    assert result.cameras[0].mean_focal_px == pytest.approx(160, rel=0.01)
+
+
+def test_cameras_of_images_are_listed_as_by_hloc(room, photos, tmp_path, capsys):
+    listed = tmp_path / "queries_with_intrinsics.txt"
+    listed.write_text("".join(f"{photos.name}/{name}.png PINHOLE 320 240 160 160 160 120\n" for name in "ab"))
+    request = ["localize", "--map", str(room.landmarks.parent), "--images", str(photos), "--camera", str(listed)]
+    assert main([*request, "--out", str(tmp_path / "out.csv")]) == 0
+    table = pd.read_csv(tmp_path / "out.csv").set_index("image")
+    assert table.loc[["a.png", "b.png"], "camera_from"].tolist() == ["listed"] * 2
+    assert "does not name this image" in table.loc["c.png", "reason"]
+    listed.write_text("a.png PINHOLE 320 240 160\n")
+    assert main(request) == 2 and "no camera in this line" in capsys.readouterr().err
 
 
 def test_where_to_look_localizes_in_the_map_that_it_opened(room, photos):

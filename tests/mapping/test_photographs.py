@@ -2,12 +2,21 @@
 
 import os
 
+import cv2
 import numpy as np
+import pycolmap
 import pytest
 from PIL import Image
 
 from wheretolook.mapping.config import PhotographsConfig
-from wheretolook.mapping.photographs import list_photographs, photograph_cameras, read_photograph, reduce_photograph
+from wheretolook.mapping.imported_map import are_turned
+from wheretolook.mapping.photographs import (
+    exif_focal_px,
+    list_photographs,
+    photograph_cameras,
+    read_photograph,
+    reduce_photograph,
+)
 from wheretolook.utils.errors import ConfigError, MapError
 
 ORIENTATION = 0x0112
@@ -114,6 +123,31 @@ def test_focal_lengths_and_shared_cameras_from_exif(tmp_path):
     assert turned.mean_focal_length() == pytest.approx(wide.mean_focal_length())
     apart = cameras_of(tmp_path, PhotographsConfig(shared_camera=False))
     assert apart.camera_of.tolist() == [0, 1, 2, 3, 4]
+
+
+def test_the_resolution_of_a_sensor_is_that_of_the_photograph_as_taken(tmp_path):
+    exif = Image.Exif()
+    exif.get_ifd(EXIF_IFD).update({0x920A: 5.0, 0xA20E: 800.0, 0xA210: 4, 0xA002: 4000, 0xA003: 3000})  # 4,000 px wide
+    Image.fromarray(sized(300, 400)).save(tmp_path / "small.jpg", exif=exif)
+    assert exif_focal_px(tmp_path / "small.jpg") == pytest.approx(5 * 800 / 10)
+    save(tmp_path / "none.jpg", sized(300, 400))
+    assert exif_focal_px(tmp_path / "none.jpg") is None
+
+
+@pytest.mark.parametrize("as_upright", [False, True])
+def test_keypoints_decide_whether_a_model_read_photographs_upright(tmp_path, as_upright):
+    rgb = np.random.default_rng(0).integers(0, 255, (15, 20, 3), dtype=np.uint8)
+    rgb = cv2.resize(rgb, (320, 240), interpolation=cv2.INTER_CUBIC)
+    save(tmp_path / "a.jpg", rgb, orientation=3)
+    read = cv2.cvtColor(read_photograph(tmp_path / "a.jpg", as_upright), cv2.COLOR_RGB2GRAY)
+    pixels = np.array([keypoint.pt for keypoint in cv2.SIFT_create(200).detect(read, None)]) + 0.5
+    model = pycolmap.Reconstruction()
+    model.add_camera_with_trivial_rig(pycolmap.Camera.create_from_model_name(1, "SIMPLE_PINHOLE", 300, 320, 240))
+    image = pycolmap.Image(name="a.jpg", camera_id=1, image_id=1, keypoints=pixels)
+    model.add_image_with_trivial_frame(image, pycolmap.Rigid3d())
+    for n in range(len(pixels)):
+        model.add_point3D(np.array([0, 0, 1.0]), pycolmap.Track([pycolmap.TrackElement(1, n)]))
+    assert are_turned(model, tmp_path) is as_upright
 
 
 def test_intrinsics_can_be_given(tmp_path):

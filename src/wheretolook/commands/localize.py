@@ -14,6 +14,7 @@ from wheretolook.commands.options import CameraOptions
 from wheretolook.dataset.config import checked_accuracy
 from wheretolook.features.extractor import ExtractorConfig
 from wheretolook.figures import KINDS
+from wheretolook.geometry.camera import Camera
 from wheretolook.mapping.config import FrameOptions
 from wheretolook.mapping.photographs import SUFFIXES, find_photograph_files
 from wheretolook.utils.devices import usable_device
@@ -32,8 +33,11 @@ class Localize(CameraOptions, FrameOptions):
 
     Map: its descriptors are those of a COLMAP database or of hloc's features in HDF5, by default the ones in the model's
     folder or above it. Images are described by the extractor of these.
-    Camera: by default the model's, for an image of the same name or proportions; else a pinhole of the EXIF focal
-    length. Images are reduced to the size of the map's.
+    Camera: by default the model's for the mapping image of the same name. Otherwise it is assumed: one of the model of
+    the same proportions, or a pinhole of the EXIF focal length, whose focal length is refined with the pose, from 1/1.6 to
+    1.6 of it; deviation and probability state what stays uncertain. The column camera_from names the camera, focal_px its
+    focal length. A file of the cameras of images (--camera FILE) has lines such as hloc's queries_with_intrinsics.txt:
+    name MODEL width height parameters. Images are reduced to the size of the map's.
 
     Rotations (--turns), a row for each image: its name in the column image, or the nearest time stamp for images that
     are named by their time, or in the order of the images:
@@ -107,9 +111,16 @@ class Localize(CameraOptions, FrameOptions):
     def _extractor(self) -> ExtractorConfig | None:
         return None if self.extractor is None else ExtractorConfig(self.extractor, weights=self.extractor_weights)
 
+    def named_camera(self) -> Camera | int | Path | None:
+        """Return the camera of all images, its camera_id, or the file of the cameras of images."""
+        if self.camera is not None and self.camera_id is None and Path(self.camera).is_file():
+            return Path(self.camera)
+        return super().named_camera()
+
     def run(self) -> list[Localized]:
         """Localize the images, write `out` and `figure`, and print a summary."""
-        from wheretolook.select.localized import check_localized_format, distinct_names, save_localized
+        from wheretolook.select.localized import check_localized_format, save_localized
+        from wheretolook.select.query_images import distinct_names
 
         start = time.monotonic()
         if self.out is not None:

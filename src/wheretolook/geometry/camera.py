@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from numbers import Integral
 from pathlib import Path
@@ -14,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from wheretolook.geometry.poses import Float
 from wheretolook.utils.errors import ConfigError, MapError, TableError, check_choice
-from wheretolook.utils.files import write_text
+from wheretolook.utils.files import read_text, write_text
 
 if TYPE_CHECKING:
     import pycolmap
@@ -261,6 +262,39 @@ def camera_of(model: str, width: int, height: int, params: Iterable[float]) -> C
     return camera
 
 
+def scale_focal(camera: Camera, ratio: float) -> Camera:
+    """The camera with its focal lengths multiplied by a ratio, and the same distortion; a panorama as it is."""
+    if isinstance(camera, PinholeCamera):
+        focal_y_px = None if camera.focal_y_px is None else camera.focal_y_px * ratio
+        return replace(camera, focal_px=camera.focal_px * ratio, focal_y_px=focal_y_px)
+    params = np.array(camera.params)
+    params[list(camera._camera.focal_length_idxs())] *= ratio
+    return replace(camera, params=tuple(params.tolist()))
+
+
+def turn_camera(camera: Camera, quarters: int) -> Camera:
+    """The camera of images turned to the left by quarters, as by `np.rot90`.
+
+    Raises ConfigError for models whose images or distortion have no such turn.
+    """
+    for _ in range(quarters % 4):
+        given = camera.colmap
+        if given.model in ("EQUIRECTANGULAR", "RAD_TAN_THIN_PRISM_FISHEYE"):
+            raise ConfigError("a camera of this model is not turned with its images", value=given.model)
+        names = given._camera.params_info.split(", ")
+        old = dict(zip(names, given.params, strict=True))
+        # the pixel (u, v) becomes (v, width - u), the direction (x, y) becomes (y, -x)
+        new = {**old, "cx": old["cy"], "cy": given.width - old["cx"]}
+        if "fy" in old:
+            new |= {"fx": old["fy"], "fy": old["fx"]}
+        if "p1" in old:
+            new |= {"p1": -old["p2"], "p2": old["p1"]}
+        if "sx1" in old:
+            new |= {"sx1": old["sy1"], "sy1": -old["sx1"]}
+        camera = camera_of(given.model, given.height, given.width, new.values())
+    return camera
+
+
 def mean_focal_px(camera: pycolmap.Camera) -> float:
     """Mean focal length in pixels; of a panorama, pixels per radian across."""
     if len(camera.focal_length_idxs()) == 0:
@@ -294,21 +328,41 @@ def parse_size(text: str) -> tuple[int, int]:
     return int(width), int(height)
 
 
+def read_named_cameras(path: Path) -> dict[str, Camera]:
+    """Read cameras by the names of their images, a line each: name, model, size, parameters, as hloc lists queries.
+
+    Raises TableError if the file cannot be read, a line describes no camera, or two lines of a name differ.
+    """
+    cameras: dict[str, Camera] = {}
+    try:
+        lines = read_text(path, 2**28).splitlines()
+    except (OSError, ValueError) as error:
+        raise TableError(f"the list of cameras cannot be read: {error}", path=path) from error
+    for line in lines:
+        if line.strip() and not line.startswith("#"):
+            found = re.fullmatch(r"(\S.*?)\s+(\w+\s+\d+\s+\d+\s.*)", line.strip())
+            try:
+                if found is None:
+                    raise ConfigError("a line is: name MODEL width height parameters")
+                camera = parse_camera(found[2])
+                if cameras.setdefault(found[1], camera) != camera:
+                    raise ConfigError("another line has this name")
+            except ConfigError as error:
+                raise TableError(f"no camera in this line: {error}", path=path, value=line[:200]) from error
+    return cameras
+
+
 def read_cameras(path: Path) -> dict[int, Camera]:
     """Cameras by their camera_id from a file in COLMAP's text format, a line each: id, model, size, parameters.
 
     Raises:
         TableError: a line describes no camera.
     """
-    cameras: dict[int, Camera] = {}
-    for line in path.read_text(errors="replace").splitlines():
-        if line.strip() and not line.startswith("#"):
-            try:
-                number, text = line.split(maxsplit=1)
-                cameras[int(number)] = parse_camera(text)
-            except (ValueError, ConfigError) as error:
-                raise TableError(f"no camera in this line: {error}", path=path, value=line[:200]) from error
-    return cameras
+    cameras = read_named_cameras(path)
+    try:
+        return {int(name): camera for name, camera in cameras.items()}
+    except ValueError as error:
+        raise TableError("a camera_id is no number", path=path) from error
 
 
 def write_cameras(cameras: Mapping[int, Camera], path: Path) -> None:

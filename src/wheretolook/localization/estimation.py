@@ -112,63 +112,88 @@ def match_under(look: Look, points: Float, cam_from_world: Float, radius_px: flo
     return replace(look, pixels=candidates.pixels[order], rows=candidates.landmarks[order])
 
 
-def refine_rotations(
+def refine_jointly(
     looks: Sequence[Look],
     points: Sequence[Float],
     inliers: Sequence[NDArray[np.bool_]],
     rig_from_world: Float,
     cams_from_world: Float,
     noise_rad: float,
-) -> tuple[Float, Float]:
-    """Refine the rig's pose (3, 4) and its views' poses (N, 3, 4) on the inliers.
+    with_focal: bool = False,
+) -> tuple[list[Look], Float, Float, Float]:
+    """Refine the rig's pose (3, 4), its views' poses (N, 3, 4) and, `with_focal`, assumed focal lengths on the inliers.
 
-    Gauss-Newton on the rig's pose and one small rotation of each view about its centre, with Cauchy weights (one pixel)
-    on the keypoints and a quadratic prior on the rotations, whose standard deviation about each axis is `noise_rad`.
-    Rotations start as in `cams_from_world`; points (M, 3) m and masks (M,) are given for each view.
+    Gauss-Newton on the rig's pose, the log of a factor of all assumed focal lengths, and one small rotation of each view
+    about its centre, with Cauchy weights (one pixel) on the keypoints and a quadratic prior on the rotations, whose
+    standard deviation about each axis is `noise_rad`; 0 for exact ones. Rotations start as in `cams_from_world`; points
+    (M, 3) m and masks (M,) are given for each view. Returns the views with the refined focal lengths, both poses, and
+    the normal matrix (7 + 3 N, 7 + 3 N), for keypoints with a noise of one pixel.
     """
+    looks = list(looks)
     cam_from_rig = np.stack([look.cam_from_rig for look in looks])
     rig = rig_from_world
     turns = cams_from_world[:, :, :3] @ rig[:, :3].T @ cam_from_rig[:, :, :3].swapaxes(1, 2)
     for _ in range(20):
-        step = _solve(looks, points, inliers, rig, turns, noise_rad)
+        normal, right = _normal_equations(looks, points, inliers, rig, turns, noise_rad, with_focal)
+        step = np.linalg.lstsq(normal, right, rcond=None)[0]
+        step[6] = np.clip(step[6], -0.2, 0.2)
         turn = Rotation.from_rotvec(step[:3]).as_matrix()
         rig = compose_poses(np.column_stack([turn, step[3:6]]), rig)
-        turns = Rotation.from_rotvec(step[6:].reshape(-1, 3)).as_matrix() @ turns
-        if np.abs(step).max() < 1e-9:  # metres and radians
+        turns = Rotation.from_rotvec(step[7:].reshape(-1, 3)).as_matrix() @ turns
+        if with_focal:
+            looks = [look.scaled(float(np.exp(step[6]))) for look in looks]
+        if np.abs(step).max() < (1e-4 if with_focal else 1e-9):  # metres and radians
             break
-    return rig, turns @ compose_poses(cam_from_rig, rig)
+    return looks, rig, turns @ compose_poses(cam_from_rig, rig), normal
 
 
-def _solve(
+def _normal_equations(
     looks: Sequence[Look],
     points: Sequence[Float],
     inliers: Sequence[NDArray[np.bool_]],
     rig: Float,
     turns: Float,
     noise_rad: float,
-) -> Float:
-    """Gauss-Newton step (6 + 3 N,): left perturbations of rig_from_world (rotation, translation), then of rotations."""
-    normal = np.zeros((6 + 3 * len(looks), 6 + 3 * len(looks)))
+    with_focal: bool,
+) -> tuple[Float, Float]:
+    """Normal matrix and right side of a Gauss-Newton step (7 + 3 N,).
+
+    The step has left perturbations of rig_from_world (rotation, translation), of the log of the focal length, and of the
+    views' rotations. Those that are not refined have the identity and 0.
+    """
+    normal = np.eye(7 + 3 * len(looks))
+    normal[:6, :6] = 0
+    normal[6, 6] = not with_focal
     right = np.zeros(len(normal))
     for k, look in enumerate(looks):
-        columns_of_turn = slice(6 + 3 * k, 9 + 3 * k)
-        normal[columns_of_turn, columns_of_turn] += np.eye(3) / noise_rad**2
-        right[columns_of_turn] -= Rotation.from_matrix(turns[k]).as_rotvec() / noise_rad**2
+        columns_of_turn = slice(7 + 3 * k, 10 + 3 * k)
+        if noise_rad:
+            normal[columns_of_turn, columns_of_turn] = np.eye(3) / noise_rad**2
+            right[columns_of_turn] -= Rotation.from_matrix(turns[k]).as_rotvec() / noise_rad**2
         if not inliers[k].any():
             continue
         in_rig = transform(rig, points[k][inliers[k]])
         in_camera = transform(look.cam_from_rig, in_rig) @ turns[k].T
-        error = look.camera.project(in_camera) - look.pixels[inliers[k]]
+        projected = look.camera.project(in_camera)
+        error = projected - look.pixels[inliers[k]]
         by_point = _projection_jacobian(look, in_camera)
         by_rig = by_point @ turns[k] @ look.cam_from_rig[:, :3]
         # the derivative of a rotated point is the cross product with it
-        by_rotations = np.cross(in_rig[:, None], by_rig), np.cross(in_camera[:, None], by_point)
-        jacobian = np.concatenate([by_rotations[0], by_rig, by_rotations[1]], axis=2)
+        derivatives = [np.cross(in_rig[:, None], by_rig), by_rig]
+        columns = np.arange(6)
+        if with_focal and look.focal is not None:
+            derivatives.append((projected - look.camera.principal_point)[:, :, None])
+            columns = np.append(columns, 6)
+        if noise_rad:
+            derivatives.append(np.cross(in_camera[:, None], by_point))
+            columns = np.r_[columns, columns_of_turn]
+        jacobian = np.concatenate(derivatives, axis=2)
         weight = 1 / (1 + (error**2).sum(1))
-        columns = np.r_[0:6, columns_of_turn]
+        usable = np.isfinite(jacobian).all(axis=(1, 2)) & np.isfinite(error).all(axis=1)
+        jacobian, error, weight = jacobian[usable], error[usable], weight[usable]
         normal[np.ix_(columns, columns)] += np.einsum("m,mij,mik->jk", weight, jacobian, jacobian)
         right[columns] -= np.einsum("m,mij,mi->j", weight, jacobian, error)
-    return np.linalg.lstsq(normal, right, rcond=None)[0]
+    return normal, right
 
 
 def _projection_jacobian(look: Look, points_cam: Float) -> Float:
@@ -202,6 +227,7 @@ class Hypothesis:
         cams_from_world: (N, 3, 4) poses of the views.
         inliers: N masks (M_k,) of the matches of each view.
         support: sum over inliers of a weight that falls from 1 to 0 as the error rises to its limit.
+        of_focal: (6, 6) covariance that an assumed focal length adds.
     """
 
     rig: RigMatches
@@ -209,6 +235,7 @@ class Hypothesis:
     cams_from_world: Float
     inliers: tuple[NDArray[np.bool_], ...]
     support: float
+    of_focal: Float | float = 0.0
 
     @property
     def n_inliers(self) -> int:
@@ -222,23 +249,71 @@ class Hypothesis:
 
     @property
     def covariance(self) -> Float:
-        """Covariance (6, 6) of position (m) and orientation (rad), from the inliers and their errors.
+        """Covariance (6, 6) of position (m) and orientation (rad), from the inliers, their errors and `of_focal`.
 
         Off the optical axis a pixel spans a smaller angle: by the cosine squared along and the cosine across. Infinite
         where the inliers do not determine the pose.
         """
         numbers = np.zeros(N_NUMBERS)
-        total = 0.0
         for look, mask, cam in zip(self.rig.looks, self.inliers, self.cams_from_world, strict=True):
-            points = self.rig.estimator.points[look.rows[mask]]
-            offsets = points - camera_centers(cam)
+            offsets = self.rig.estimator.points[look.rows[mask]] - camera_centers(cam)
             cosine = np.clip(offsets @ cam[2, :3] / np.linalg.norm(offsets, axis=1), 0.05, 1)
             numbers += (look.camera.mean_focal_px / cosine) ** 2 @ bearing_numbers(offsets)
-            total += float(squared_errors(look.camera, look.pixels[mask], points, cam).sum())
         information = information_matrices(numbers)
         if self.n_inliers <= 3 or np.linalg.cond(information) > 1e14:
             return np.full((6, 6), np.inf)
-        return np.linalg.inv(information) * max(total / (2 * self.n_inliers - 6), 0.01)
+        return np.linalg.inv(information) * self.variance + self.of_focal
+
+    @property
+    def variance(self) -> float:
+        """Variance of a coordinate of keypoints in square pixels, from the errors of four inliers or more."""
+        total = 0.0
+        for look, mask, cam in zip(self.rig.looks, self.inliers, self.cams_from_world, strict=True):
+            points = self.rig.estimator.points[look.rows[mask]]
+            total += float(squared_errors(look.camera, look.pixels[mask], points, cam).sum())
+        return max(total / (2 * self.n_inliers - 6), 0.01)
+
+    def with_focal(self) -> Hypothesis:
+        """Refine assumed focal lengths with the pose, and add what stays uncertain of them to the covariance.
+
+        The pose is that of the focal length by `FocalPrior.posterior`, so an assumed one that the inliers agree with is
+        kept.
+        """
+        prior = next((look.focal for look in self.rig.looks if look.focal is not None), None)
+        if prior is None:
+            return self
+        rig = self.rig
+        best = self
+        for _ in range(3):
+            if best.n_inliers < MIN_MATCHES:
+                return replace(best, of_focal=np.inf)
+            looks, pose, cams, normal = refine_jointly(
+                best.rig.looks,
+                best.rig.points,
+                best.inliers,
+                best.rig_from_world,
+                best.cams_from_world,
+                rig.noise_rad,
+                True,
+            )
+            if not (np.isfinite(pose).all() and all(prior.allows(look.camera) for look in looks if look.focal)):
+                return replace(best, of_focal=np.inf)
+            refined = RigMatches(rig.estimator, looks, rig.turn_noise_deg).evaluate(pose, cams=cams)
+            same = np.array_equal(np.concatenate(best.inliers), np.concatenate(refined.inliers))
+            best = refined
+            if same:
+                break
+        normal[6, 6] += 0.01  # a wall that the camera faces does not determine it
+        covariance = np.linalg.pinv(normal, hermitian=True)
+        by_focal = covariance[:6, 6] / covariance[6, 6]
+        look = next(look for look in best.rig.looks if look.focal is not None)
+        log_focal = float(np.log(look.camera.mean_focal_px))
+        mean, variance = prior.posterior(log_focal, best.variance * covariance[6, 6])
+        scaled = [look.scaled(float(np.exp(mean - log_focal))) for look in best.rig.looks]
+        kept = RigMatches(rig.estimator, scaled, rig.turn_noise_deg).refine(best.rig_from_world)
+        world_from_rig = kept.rig_from_world[:, :3].T
+        shift = np.concatenate([-world_from_rig @ by_focal[3:], world_from_rig @ by_focal[:3]])
+        return replace(kept, of_focal=variance * np.outer(shift, shift))
 
     def differs_from(self, other: Hypothesis) -> bool:
         """Whether this is another pose: more than 0.5 m or 10 degrees away."""
@@ -283,7 +358,7 @@ class RigMatches:
         """Poses of the only view as its single-image localization left them, in their order."""
         hypotheses = []
         for pose, mask in poses:
-            evaluated = self._evaluate(self.rig_pose(0, pose))
+            evaluated = self.evaluate(self.rig_pose(0, pose))
             hypotheses.append(replace(evaluated, inliers=(mask,)))
         return hypotheses
 
@@ -291,7 +366,7 @@ class RigMatches:
         """Match all keypoints again under a hypothesis and refine it, with a radius that decreases."""
         for radius_px in (12.0, 6.0):  # the first corrects the error of a pose from few matches
             cams = hypothesis.cams_from_world
-            views = zip(self.looks, self._candidates, cams, strict=True)
+            views = zip(hypothesis.rig.looks, self._candidates, cams, strict=True)
             looks = [match_under(look, points, pose, radius_px) for look, points, pose in views]
             rig = RigMatches(self.estimator, looks, self.turn_noise_deg)
             if sum(len(look.rows) for look in looks) < MIN_MATCHES:
@@ -335,16 +410,16 @@ class RigMatches:
         degrees for two views of validation scenes, and 93.4 % with a scale of one pixel; for a single view both scales are
         equally good.
         """
-        best = self._evaluate(rig_from_world, self.loose_px)
+        best = self.evaluate(rig_from_world, self.loose_px)
         loss = {"loss_type": "CAUCHY", "loss_scale": 0.5}
         for _ in range(3):  # mostly the second gives the same inliers
             if best.n_inliers < MIN_MATCHES:
                 break
             if self.noise_rad:
-                rig, cams = refine_rotations(
+                _, rig, cams, _ = refine_jointly(
                     self.looks, self.points, best.inliers, best.rig_from_world, best.cams_from_world, self.noise_rad
                 )
-                best = self._evaluate(rig, cams=cams)
+                best = self.evaluate(rig, cams=cams)
                 continue
             start = _poselib_pose(best.rig_from_world)
             pose, _ = poselib.refine_generalized_absolute_pose(
@@ -352,7 +427,7 @@ class RigMatches:
             )
             if not np.isfinite(pose.Rt).all():
                 break
-            refined = self._evaluate(pose.Rt)
+            refined = self.evaluate(pose.Rt)
             # accurate keypoints weigh more than in the support, which may fall a little as the pose improves
             if refined.support < 0.9 * best.support:
                 break
@@ -362,7 +437,7 @@ class RigMatches:
                 break
         return best
 
-    def _evaluate(self, rig_from_world: Float, limit_px: float | None = None, cams: Float | None = None) -> Hypothesis:
+    def evaluate(self, rig_from_world: Float, limit_px: float | None = None, cams: Float | None = None) -> Hypothesis:
         """Inliers and support of a pose, given the poses of the views if rotations are refined."""
         limit_px = limit_px or self.estimator.config.max_error_px
         if cams is None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePath
 
 import numpy as np
@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from wheretolook.features.matches import Matches, is_twin
-from wheretolook.geometry.camera import Camera, field_of_view_deg
+from wheretolook.geometry.camera import Camera, field_of_view_deg, scale_focal
 from wheretolook.geometry.pose_files import (
     CAM_FROM_BASE,
     NAME_COLUMNS,
@@ -56,6 +56,51 @@ class Candidates:
         return cls(keypoints, pixels[keypoints], matches.near[near], matches.squared[near])
 
 
+@dataclass(frozen=True)
+class FocalPrior:
+    """What is assumed of a focal length: it is one of some values, or any other in a range.
+
+    Attributes:
+        focal_px: (K,) values, in pixels.
+        deviations: (K,) one standard deviation of the log of each: 0 for that of a mapping camera, which is the same or
+            another one; EXIF data are rounded.
+        p_any: probability of any other focal length, from the smallest value / `span` to the largest times `span`.
+    """
+
+    focal_px: tuple[float, ...]
+    deviations: tuple[float, ...]
+    p_any: float = 0.5
+    span: float = 1.6
+
+    @property
+    def log_range(self) -> tuple[float, float]:
+        """Logs of the smallest and the largest focal length."""
+        return float(np.log(min(self.focal_px) / self.span)), float(np.log(max(self.focal_px) * self.span))
+
+    def allows(self, camera: Camera) -> bool:
+        """Whether a camera's focal length is in the range."""
+        low, high = self.log_range
+        return bool(low <= np.log(camera.mean_focal_px) <= high)
+
+    def posterior(self, log_focal: float, variance: float) -> tuple[float, float]:
+        """Return the log of the most probable focal length, and the mean squared error of this log.
+
+        Takes the log as estimated from an image, with its variance.
+        """
+        low, high = self.log_range
+        prior = np.square([*self.deviations])
+        total = prior + variance
+        error = log_focal - np.log(self.focal_px)
+        density = np.exp(-(error**2) / (2 * total)) / np.sqrt(2 * np.pi * total)
+        weights = np.append(density * (1 - self.p_any) / len(total), self.p_any / (high - low))
+        weights /= weights.sum()
+        # of each component: mean and variance given the estimate
+        means = np.append(np.log(self.focal_px) + error * prior / total, np.clip(log_focal, low, high))
+        variances = np.append(prior * variance / total, min(variance, (high - low) ** 2 / 12))
+        mean = float(means[np.argmax(weights)])
+        return mean, float(weights @ (variances + (means - mean) ** 2))
+
+
 @dataclass(frozen=True, eq=False)
 class Look:
     """The matches of one view of a rig.
@@ -68,13 +113,25 @@ class Look:
     rows: NDArray[np.int64]  # (M,) of the landmarks
     camera: Camera
     candidates: Candidates | None = None  # for all its keypoints, if they are to be matched again under each hypothesis
+    focal: FocalPrior | None = None  # None if the camera is known; otherwise its focal length is refined with the pose
 
     @classmethod
-    def of(cls, pixels: Float, matches: Matches, camera: Camera, cam_from_rig: Float = IDENTITY) -> Look:
+    def of(
+        cls,
+        pixels: Float,
+        matches: Matches,
+        camera: Camera,
+        cam_from_rig: Float = IDENTITY,
+        focal: FocalPrior | None = None,
+    ) -> Look:
         """Combine the matches of an image with their candidates, from the pixels (K, 2) of all its keypoints."""
         at: Float = np.asarray(pixels, dtype=np.float64)
         candidates = Candidates.of(at, matches)
-        return cls(cam_from_rig, at[matches.keypoints], matches.landmarks, camera, candidates)
+        return cls(cam_from_rig, at[matches.keypoints], matches.landmarks, camera, candidates, focal)
+
+    def scaled(self, ratio: float) -> Look:
+        """Return the view with its focal length, if that is assumed, multiplied by a ratio."""
+        return self if self.focal is None else replace(self, camera=scale_focal(self.camera, ratio))
 
     def __post_init__(self) -> None:
         rotation = self.cam_from_rig[:, :3]

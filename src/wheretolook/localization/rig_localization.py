@@ -132,6 +132,29 @@ class JointLocalizer:
             left = left[~inliers]
         return tuple(poses)
 
+    def focal_ratio(self, looks: Sequence[Look]) -> float:
+        """Return the factor of assumed focal lengths with which most matches of a view agree with its pose; else 1.
+
+        RANSAC starts from the assumed values, and if less than half of the matches agree, from others in the range.
+        """
+        view = max(looks, key=lambda look: len(look.rows) * (look.focal is not None))
+        if view.focal is None or len(view.rows) < MIN_MATCHES:
+            return 1.0
+        points = self.estimator.points[view.rows]
+        focal_px = view.camera.mean_focal_px
+        starts = [1.0, *(value / focal_px for value in view.focal.focal_px[1:])]
+        best: Hypothesis | None = None
+        for n, ratio in enumerate([*starts, 0.75, 1.33]):
+            if n >= len(starts) and best is not None and best.n_inliers > len(points) / 2:
+                break
+            start = view.scaled(ratio)
+            estimated = self.estimator.estimate_local(start.pixels, points, start.camera, RIVAL_TRIALS)
+            if estimated is not None:
+                rig = RigMatches(self.estimator, [start], 0.0)
+                found = rig.refine(rig.rig_pose(0, estimated[0]))
+                best = found if best is None or found.support > best.support else best
+        return 1.0 if best is None else best.with_focal().rig.looks[0].camera.mean_focal_px / focal_px
+
     def localize(
         self, looks: Sequence[Look], single_view_poses: Sequence[SingleViewPoses] | None = None
     ) -> JointLocalization:
@@ -158,6 +181,9 @@ class JointLocalizer:
             hypotheses = rig.hypotheses(single_view_poses)
             if all(look.candidates is not None for look in looks):
                 hypotheses = distinct([rig.guided(hypothesis) for hypothesis in hypotheses])
+            # weaker ones are not chosen, and their focal length matters little
+            least = 0.3 * max((pose.support for pose in hypotheses), default=0.0)
+            hypotheses = distinct([pose.with_focal() if pose.support > least else pose for pose in hypotheses])
         if not hypotheses:
             return JointLocalization(NO_POSE, tuple(looks), n_matches, turn_error_deg=error_deg)
         best = self._ranked(hypotheses, n_matches, first)

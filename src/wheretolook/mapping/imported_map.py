@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
-from PIL import Image
 
 from wheretolook.geometry.poses import camera_centers
 from wheretolook.mapping.colmap_model import (
@@ -22,9 +21,11 @@ from wheretolook.mapping.colmap_model import (
 )
 from wheretolook.mapping.config import EXHAUSTIVE_UP_TO, PARTNERS, ImportConfig
 from wheretolook.mapping.georeference import MapScale, MarkedPhotographs, check_tables
+from wheretolook.mapping.map import reads_upright
 from wheretolook.mapping.map_folder import DATABASE_FILE, MapDraft, MapReport, MapRun, finish_map, replacing_map
 from wheretolook.mapping.map_frame import IDENTITY, find_frame
 from wheretolook.mapping.photograph_map import PhotographFeatures, photograph_features
+from wheretolook.mapping.photographs import quarters_upright, read_photograph, reduce_photograph
 from wheretolook.mapping.triangulation import choose_pairs, triangulate_model
 from wheretolook.utils.errors import ConfigError, MapError
 from wheretolook.utils.files import image_size, path_within
@@ -40,6 +41,7 @@ class ExistingMapReport(MapReport):
     cameras: list[dict[str, Any]]  # COLMAP's intrinsics
     frame: dict[str, Any]  # the model's own, see `MapFrame.record`
     scale: MapScale
+    upright: bool = False  # whether its images are the photographs turned upright by EXIF; else they are as stored
 
 
 def map_existing(
@@ -70,9 +72,9 @@ def map_existing(
             model = reconstruction or read_model(config.model)
             n_points = model.num_points3D()
         database = config.database
-        turned = True
+        turned = reads_upright(config.model)
         if images is not None:
-            turned = _are_turned(model, images)
+            turned = are_turned(model, images)
             database = folder / DATABASE_FILE
             with run.clock("extract"):
                 names = list(registered_names(model).values())
@@ -98,6 +100,7 @@ def map_existing(
             cameras=describe_cameras(model),
             frame=frame.record(),
             scale=frame.scale,
+            upright=turned,
         )
         report.save(folder)
     IDENTITY.warn(config.model, landmarks.mapping_distance_m, poses)
@@ -156,36 +159,62 @@ def _pairs(source: Any) -> NDArray[np.int64]:
     return choose_pairs(nearness, 2 * PARTNERS, 0.0)
 
 
-def _are_turned(model: Any, folder: Path) -> bool:
+def are_turned(model: Any, folder: Path) -> bool:
     """Whether the model's images are its photographs turned upright by EXIF; else they are as stored.
 
-    COLMAP's versions differ in this. Raises MapError if a photograph is missing or unreadable, or fits its camera in
-    neither way.
+    Decided by the sizes of the cameras, and where these fit both readings by the model's keypoints (`_keypoints_found`).
+    Raises MapError if a photograph is missing or unreadable, or fits its camera in neither way.
     """
     names = registered_names(model)
-    stored = [_size(path_within(folder, name, "the name of an image of the model")) for name in names.values()]
+    paths = {number: path_within(folder, name, "the name of an image of the model") for number, name in names.items()}
+    sizes = {number: _size(path) for number, path in paths.items()}
+    quarters = {number: quarters_upright(path) for number, path in paths.items()}
     misfits = {}
-    for turned in (True, False):
-        for (number, name), (width, height, sideways) in zip(names.items(), stored, strict=True):
-            size = (height, width) if turned and sideways else (width, height)
+    for turned in (False, True):
+        for number, size in sizes.items():
+            width, height = size[::-1] if turned and quarters[number] in (1, 3) else size
             camera = model.cameras[model.images[number].camera_id]
-            if abs(size[0] * camera.height / (size[1] * camera.width) - 1) > 0.01:
-                misfits[turned] = name, size, (camera.width, camera.height)
+            if abs(width * camera.height / (height * camera.width) - 1) > 0.01:
+                misfits[turned] = number, (width, height), (camera.width, camera.height)
                 break
-        else:
-            return turned
-    name, size, expected = misfits[True]
-    problem = f"the photograph's proportions differ from those of its camera in the model, {expected}"
-    raise MapError(problem, path=folder / name, value=size, fix="Give the photographs that the model was made from.")
+    if len(misfits) == 2:
+        number, size, expected = misfits[True]
+        problem = f"the photograph's proportions differ from those of its camera in the model, {expected}"
+        raise MapError(
+            problem, path=paths[number], value=size, fix="Give the photographs that the model was made from."
+        )
+    if misfits:
+        return False in misfits
+    flagged = [model.images[number] for number, turns in quarters.items() if turns]
+    flagged = sorted(flagged, key=lambda image: -image.num_points3D)[:3]
+    found = [
+        sum(_keypoints_found(image, paths[image.image_id], turned) for image in flagged) for turned in (False, True)
+    ]
+    return found[1] > 1.5 * found[0]
 
 
-def _size(path: Path) -> tuple[int, int, bool]:
-    """Width and height of a photograph as stored, and whether its EXIF orientation swaps them."""
+def _keypoints_found(image: Any, path: Path, turned: bool) -> int:
+    """Number of the keypoints of a model's image that its photograph has, too, stored or turned, within 1.5 px.
+
+    Most detectors find the same corners as SIFT, which is asked for 1,000.
+    """
+    import cv2
+    from scipy.spatial import cKDTree
+
+    keypoints = np.array([point.xy for point in image.points2D if point.has_point3D()]).reshape(-1, 2)
+    rgb = read_photograph(path, turned)
+    rgb = reduce_photograph(rgb, max(image.camera.width, image.camera.height))
+    detected = cv2.SIFT_create(nfeatures=1000).detect(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), None)
+    if not detected or not len(keypoints):
+        return 0
+    distance, _ = cKDTree([np.add(one.pt, 0.5) for one in detected]).query(keypoints, distance_upper_bound=1.5)
+    return int(np.isfinite(distance).sum())
+
+
+def _size(path: Path) -> tuple[int, int]:
+    """Width and height of a photograph as stored."""
     try:
-        width, height = image_size(path)
-        with Image.open(path) as photograph:
-            # Orientation; 5 to 8 are stored on a side
-            return width, height, photograph.getexif().get(0x0112, 1) in (5, 6, 7, 8)
+        return image_size(path)
     except (OSError, ValueError) as error:
         fix = "Give the folder that the names of the model's images are relative to."
         raise MapError(f"cannot read an image of the model: {error}", path=path, fix=fix) from error

@@ -162,6 +162,15 @@ def source_of_map(map_dir: Path) -> Path | None:
     return _reported(map_dir, "existing", "model") or _reported(map_dir, "photographs", "images")
 
 
+def reads_upright(model_dir: Path) -> bool:
+    """Test whether a map was made from photographs turned upright by EXIF; COLMAP and hloc read them as stored."""
+    try:
+        report = read_json_object(model_dir / REPORT_FILE)
+    except (OSError, ValueError):
+        return False
+    return bool(report.get("upright", _reported(model_dir, "photographs", "images") is not None))
+
+
 def _reported(model_dir: Path, group: str, name: str) -> Path | None:
     """A path among the settings in a map's report; None if there is none."""
     try:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import struct
 from collections import Counter
 from dataclasses import dataclass
 from functools import cache
@@ -11,6 +12,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
 from wheretolook.geometry.camera import ColmapCamera
 from wheretolook.mapping.config import PhotographsConfig
@@ -112,6 +114,52 @@ def read_photograph(path: Path, turned: bool = True) -> NDArray[np.uint8]:
     return np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), dtype=np.uint8)
 
 
+def exif_of(path: Path) -> dict[int, Any]:
+    """Read the EXIF data of a photograph by tag; empty without, or if they are damaged."""
+    try:
+        with Image.open(path) as photograph:
+            tags = photograph.getexif()
+            return {**tags, **tags.get_ifd(0x8769)}
+    except (OSError, ValueError, SyntaxError, struct.error):
+        return {}
+
+
+def quarters_upright(path: Path) -> int:
+    """Return the quarter turns to the left that make a stored photograph upright by its EXIF orientation.
+
+    4 for a mirrored one.
+    """
+    orientation = exif_of(path).get(0x0112, 1)
+    return {1: 0, 3: 2, 6: 3, 8: 1}.get(orientation, 4 if orientation in (2, 4, 5, 7) else 0)
+
+
+def exif_focal_px(path: Path) -> float | None:
+    """Read the focal length of a photograph in pixels of its stored size from its EXIF data; None without.
+
+    As COLMAP, but a resolution of the sensor is that of the photograph as taken, `PixelXDimension` wide.
+    """
+    import pycolmap
+
+    tags = exif_of(path)
+    unit_mm = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}.get(tags.get(0xA210, 2), 25.4)
+    try:
+        with Image.open(path) as photograph:
+            longer = max(photograph.size)
+        taken = max(tags.get(0xA002, 0), tags.get(0xA003, 0)) or longer
+        focal_px = float(tags[0x920A]) * float(tags[0xA20E]) / unit_mm * longer / taken
+        if not tags.get(0xA405) and 0.1 * longer < focal_px < 100 * longer:
+            return focal_px
+    except (OSError, KeyError, TypeError, ValueError, ZeroDivisionError):
+        pass  # without a resolution of the sensor
+    try:
+        with quiet_colmap():
+            options = pycolmap.ImageReaderOptions(camera_model="SIMPLE_PINHOLE")
+            camera = pycolmap.infer_camera_from_image(path, options)
+    except (ValueError, RuntimeError):  # a format that COLMAP does not read
+        return None
+    return float(camera.mean_focal_length()) if camera.has_prior_focal_length else None
+
+
 def reduce_photograph(rgb: NDArray[np.uint8], max_side_px: int) -> NDArray[np.uint8]:
     """Reduce a photograph (H, W, 3) to `max_side_px` pixels along its longer side, if it is larger; 0 keeps its size."""
     import cv2
@@ -177,11 +225,8 @@ def _camera(path: Path, size: list[int], config: PhotographsConfig) -> Any:
         return camera
     if model not in pycolmap.CameraModelId.__members__ or model == "INVALID":
         raise ConfigError("COLMAP has no such camera model", value=model, fix="For instance SIMPLE_RADIAL.")
-    try:
-        with quiet_colmap():
-            inferred = pycolmap.infer_camera_from_image(path, pycolmap.ImageReaderOptions(camera_model=model))
-    except (ValueError, RuntimeError) as error:
-        raise MapError(f"cannot read this photograph: {error}", path=path, fix="Remove it.") from error
-    camera = pycolmap.Camera.create_from_model_name(0, model, inferred.mean_focal_length(), width, height)
-    camera.has_prior_focal_length = inferred.has_prior_focal_length
+    focal_px = exif_focal_px(path)
+    assumed = 1.2 * max(width, height)  # as in COLMAP
+    camera = pycolmap.Camera.create_from_model_name(0, model, focal_px or assumed, width, height)
+    camera.has_prior_focal_length = focal_px is not None
     return camera

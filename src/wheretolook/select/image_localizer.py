@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import warnings
 from collections import defaultdict
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path, PurePath
 from typing import Any
@@ -14,10 +14,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import csr_array
 
-from wheretolook.dataset.config import ACCURACY, Accuracy, checked_accuracy
+from wheretolook.dataset.config import ACCURACY, CONTRADICTED, LOCALIZED, Accuracy, checked_accuracy
 from wheretolook.features.extractor import EXTRACTORS, KINDS, ExtractorConfig, Keypoints, kind_of, runnable_extractors
 from wheretolook.features.matches import Matches
-from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.poses import Float
 from wheretolook.localization.confidence import probabilities
 from wheretolook.localization.config import LocalizerConfig
@@ -31,7 +30,8 @@ from wheretolook.mapping.georeference import REPORT_FILE
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.mapping.map import Map, find_features, find_photographs, has_image
 from wheretolook.mapping.map_frame import MapFrame
-from wheretolook.select.localized import Localized, QueryImage, QueryImages, distinct_names
+from wheretolook.select.localized import Localized
+from wheretolook.select.query_images import KnownCamera, QueryImage, QueryImages, distinct_names
 from wheretolook.utils.errors import ConfigError, MapError, MapWarning, PoseError, TableError, from_record
 from wheretolook.utils.files import path_ends, read_json_object, read_text
 
@@ -172,7 +172,7 @@ class ImageLocalizer:
         self,
         images: Image | Sequence[Image],
         turns: str | Path | ArrayLike | None = None,
-        camera: Camera | int | None = None,
+        camera: KnownCamera | int | str | Path | None = None,
         prior: Sequence[float] | None = None,
         accuracy: Accuracy = ACCURACY,
         names: Sequence[str] | None = None,
@@ -183,8 +183,8 @@ class ImageLocalizer:
             images: a file, or an array (H, W, 3) uint8 RGB; with `turns` several.
             turns: rotations `cam_from_rig` (N, 3, 3), or poses (N, 3, 4) in metres; or a file, see
                 `wheretolook.localization.rig.read_turns`.
-            camera: of the images, or its camera_id in the model; None for the model's, or a pinhole of the EXIF focal
-                length, see `QueryImages`.
+            camera: of the images, or its camera_id in the model, or a file of the cameras of images, a line each: name,
+                MODEL, width, height, parameters; None to assume the model's, or the EXIF focal length, see `QueryImages`.
             prior: rough location x, y, z of the camera in the map, and perhaps yaw in degrees of an image: one more
                 hypothesis, which wins only if the matches support it best.
             accuracy: limits in metres and degrees that the probability refers to.
@@ -207,28 +207,58 @@ class ImageLocalizer:
         if len(given) != len(cam_from_rig) or not given:
             fix = "Give one image, or turns."
             raise ConfigError("several images are localized together by their rotations", value=len(given), fix=fix)
-        camera = self.images.known_camera(camera)
+        known = camera if isinstance(camera, Mapping) else self.images.known_camera(camera)
         names = names or distinct_names([Path(path) for path in paths])
-        queries = [self.images.read(image, name, camera) for image, name in zip(given, names, strict=True)]
+        queries = [self.images.read(image, name, known) for image, name in zip(given, names, strict=True)]
         near = None if prior is None else PosePrior.of(prior, self.frame.world_from_map)
         limits = checked_accuracy(accuracy, self.landmarks.mapping_distance_m)
+        results = [self._localize(paths, queries, cam_from_rig, near, limits)]
+        if len(queries) == 1:
+            (query,) = queries
+            readings = [*query.others]
+            if query.quarters and not self._localizer.kind.in_bytes:  # learned features change as an image turns
+                readings.append(replace(query, is_turned=True))
+            results += [self._localize(paths, [reading], cam_from_rig, near, limits) for reading in readings]
+        return max(results, key=lambda result: (result.status in (LOCALIZED, CONTRADICTED), result.n_inliers))
+
+    def _localize(
+        self,
+        paths: Sequence[str],
+        queries: Sequence[QueryImage],
+        cam_from_rig: Float,
+        near: PosePrior | None,
+        limits: Accuracy,
+    ) -> Localized:
+        """Localize images that were read, given their names in the pairs of images and their poses in the rig."""
         rig = self._rigs if len(queries) > 1 else self._localizer.joint
-        looks = []
-        poses = []
+        count = POSES_OF_A_VIEW if len(queries) > 1 else POSES_OF_AN_IMAGE
+        views: list[list[Look]] = []
+        of_prior: list[Look] = []
         for path, query, pose in zip(paths, queries, cam_from_rig, strict=True):
-            keypoints = self._localizer.extractor.extract(query.rgb)
+            keypoints = self._extract(query)
             found = self._match(path, keypoints, query)
-            views = [Look.of(keypoints.pixels, matches, query.camera, pose) for matches in found]
-            count = POSES_OF_A_VIEW if len(queries) > 1 else POSES_OF_AN_IMAGE
-            poses.append(sum((rig.single_view_poses(view, count) for view in views), ()))
-            looks.append(views[0])
+            views.append([Look.of(keypoints.pixels, one, query.camera, pose, query.focal) for one in found])
             if near is not None:
                 max_ratio = self._localizer.config.max_ratio if self._localizer.kind.in_bytes else None
                 allowed = near.allows(self.landmarks.points, self.landmarks.mapping_distance_m, query.camera)
                 matches = matches_among(found[0], allowed, max_ratio, self._localizer.twins)
-                poses[-1] += rig.single_view_poses(Look.of(keypoints.pixels, matches, query.camera, pose), 1)
-        joint = rig.localize(looks, poses)
+                of_prior.append(Look.of(keypoints.pixels, matches, query.camera, pose, query.focal))
+        ratio = rig.focal_ratio([first for first, *_ in views])
+        views = [[look.scaled(ratio) for look in of_image] for of_image in views]
+        poses = [sum((rig.single_view_poses(look, count) for look in of_image), ()) for of_image in views]
+        for n, look in enumerate(of_prior):
+            poses[n] += rig.single_view_poses(look.scaled(ratio), 1)
+        joint = rig.localize([first for first, *_ in views], poses)
         return Localized.of(queries, joint, probabilities(joint, limits), self.frame)
+
+    def _extract(self, query: QueryImage) -> Keypoints:
+        """Extract the keypoints of an image, or of it turned upright, at the pixels of the image."""
+        turns = query.quarters if query.is_turned else 0
+        keypoints = self._localizer.extractor.extract(np.ascontiguousarray(np.rot90(query.rgb, turns)))
+        height, width = query.rgb.shape[:2]
+        x, y = keypoints.pixels.T
+        x, y = ((x, y), (width - y, x), (width - x, height - y), (y, height - x))[turns]
+        return replace(keypoints, pixels=np.column_stack([x, y]))
 
     def _match(self, name: str, keypoints: Keypoints, query: QueryImage) -> list[Matches]:
         """Match an image with all landmarks, or with those of its pairs; by LightGlue, and then also by descriptors.

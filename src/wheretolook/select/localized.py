@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -10,142 +9,19 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
-import pycolmap
-from numpy.typing import NDArray
 
 from wheretolook.dataset.config import CONTRADICTED, LOCALIZED, NO_POSE
-from wheretolook.geometry.camera import Camera, PinholeCamera, camera_of, describe_camera
+from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.pose_files import images_text
 from wheretolook.geometry.poses import Float, camera_centers, pan_tilt_angles, quaternion_from_rotation
 from wheretolook.localization.rig_localization import JointLocalization
-from wheretolook.mapping.colmap_model import find_camera
-from wheretolook.mapping.map import Map
 from wheretolook.mapping.map_frame import IDENTITY, MapFrame
-from wheretolook.mapping.photographs import read_photograph, reduce_photograph
-from wheretolook.utils.errors import ConfigError, PoseError
-from wheretolook.utils.files import path_ends, write_json, write_text
-from wheretolook.utils.texts import quiet_colmap
+from wheretolook.select.query_images import QueryImage
+from wheretolook.utils.errors import ConfigError
+from wheretolook.utils.files import write_json, write_text
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-
-MAX_FOCAL_RATIO = 1.05  # of focal lengths that count as equal; those in EXIF data are rounded
-
-
-@dataclass(frozen=True, eq=False)
-class QueryImage:
-    """An image to localize, as its keypoints are extracted, and its camera."""
-
-    name: str
-    rgb: NDArray[np.uint8]  # (H, W, 3)
-    camera: Camera  # of that size
-
-
-class QueryImages:
-    """Reads images to localize in a map, opened from a COLMAP model.
-
-    The camera of an image is the given one. Otherwise it is the model's: that of the mapping image of the same name, or
-    of those of the same proportions if their focal lengths agree; unless the EXIF focal length contradicts it.
-    Otherwise it is a pinhole of the EXIF focal length.
-    """
-
-    def __init__(self, opened: Map) -> None:
-        assert opened.path is not None and opened.images is not None
-        self.folder = opened.path
-        self.cameras = opened.cameras
-        ids = opened.images.image_cameras.tolist()
-        self.by_name = {name: self.cameras[i] for name, i in zip(opened.images.image_names, ids, strict=True)}
-
-    def known_camera(self, camera: Camera | int | None) -> Camera | None:
-        """Return a camera, given as one or by its camera_id. Raises MapError if the model has no such camera."""
-        if camera is not None and not isinstance(camera, (int, Camera)):
-            raise ConfigError("this is no camera", value=camera, fix="Give a Camera, or a camera_id of the model.")
-        return None if camera is None else find_camera(self.cameras, self.folder, camera)
-
-    def read(self, image: str | Path | NDArray[np.uint8], name: str, camera: Camera | None = None) -> QueryImage:
-        """Read a file, or take an array (H, W, 3) uint8 RGB, of a given or known camera.
-
-        Raises MapError if the file cannot be read, PoseError for an array that is no image, ConfigError if the camera
-        is unknown or has other proportions.
-        """
-        if isinstance(image, np.ndarray):
-            if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3 or 0 in image.shape:
-                raise PoseError("an image is an array (H, W, 3) uint8", value=(image.shape, str(image.dtype)))
-            return _fitted(name, image, self._camera(None, image, camera))
-        path = Path(image)
-        rgb = read_photograph(path)
-        expected = camera or self._named(path)
-        if expected is not None and not _has_proportions(expected, rgb):
-            stored = read_photograph(path, turned=False)  # as some versions of COLMAP read photographs
-            rgb = stored if _has_proportions(expected, stored) else rgb
-        return _fitted(name, rgb, self._camera(path, rgb, camera))
-
-    def _named(self, path: Path) -> Camera | None:
-        """Return the camera of the mapping image of the same name: of the longest end of the path, at least the file name."""
-        return next((self.by_name[end] for end in path_ends(path.absolute()) if end in self.by_name), None)
-
-    def _camera(self, path: Path | None, rgb: NDArray[np.uint8], given: Camera | None) -> Camera:
-        height, width = rgb.shape[:2]
-        size = f"{width} x {height} px"
-        if given is not None:
-            if not _has_proportions(given, rgb):
-                problem = f"the image of {size} has other proportions than the camera"
-                raise ConfigError(problem, path=path, value=describe_camera(given), fix="Correct --camera.")
-            return given
-        named = None if path is None else self._named(path)
-        alike = [camera for camera in self.cameras.values() if _has_proportions(camera, rgb)]
-        if named is not None and named in alike:
-            alike = [named]
-        focal = np.array([camera.colmap.mean_focal_px / camera.width for camera in alike])
-        in_exif = None if path is None else _exif_focal_px(path)
-        if len(alike) and focal.max() <= MAX_FOCAL_RATIO * focal.min():
-            camera = alike[int(np.argsort(focal)[len(focal) // 2])]
-            ratio = 1.0 if in_exif is None else in_exif / width / focal.min()
-            if 1 / MAX_FOCAL_RATIO**2 <= ratio <= MAX_FOCAL_RATIO**2:
-                return camera
-        if in_exif is not None:
-            return PinholeCamera(width, height, in_exif)
-        problem = f"the camera of this image of {size} is unknown: it has no EXIF focal length"
-        problem += f", and the map has {len(alike)} cameras of its proportions that differ" if alike else ""
-        raise ConfigError(problem, path=path, fix="Give --camera MODEL,width,height,parameters, in Python camera.")
-
-
-def distinct_names(paths: Sequence[Path]) -> list[str]:
-    """Return the names of files, or where some are equal, the paths from the folder that has all."""
-    names = [path.name for path in paths]
-    if len({*names}) == len(names):
-        return names
-    folder = os.path.commonpath([path.absolute().parent for path in paths])
-    return [os.path.relpath(path, folder) for path in paths]
-
-
-def _has_proportions(camera: Camera, rgb: NDArray[np.uint8]) -> bool:
-    height, width = rgb.shape[:2]
-    ratio = width * camera.height / (height * camera.width)
-    return 1 / 1.01 <= ratio <= 1.01
-
-
-def _fitted(name: str, rgb: NDArray[np.uint8], camera: Camera) -> QueryImage:
-    """Reduce an image to the size of its camera and to 1,600 px, and return it with the camera of that size."""
-    reduced = reduce_photograph(rgb, min(1600, max(camera.width, camera.height)))
-    height, width = reduced.shape[:2]
-    if (width, height) != (camera.width, camera.height):
-        scaled = pycolmap.Camera(**camera.colmap.record())
-        scaled.rescale(width, height)
-        camera = camera_of(scaled.model_name, width, height, scaled.params)
-    return QueryImage(name, reduced, camera)
-
-
-def _exif_focal_px(path: Path) -> float | None:
-    """Read the focal length of a photograph in pixels from its EXIF data; None without."""
-    options = pycolmap.ImageReaderOptions(camera_model="SIMPLE_PINHOLE")
-    try:
-        with quiet_colmap():
-            camera = pycolmap.infer_camera_from_image(path, options)
-    except (ValueError, RuntimeError):  # a format that COLMAP does not read
-        return None
-    return float(camera.mean_focal_length()) if camera.has_prior_focal_length else None
 
 
 FAILED = "error"  # status of an image that cannot be read, or whose camera is unknown
@@ -168,7 +44,8 @@ class Localized:
         deviation: one standard deviation of the position, in the map's unit, and of the orientation in degrees.
         rivals: other poses that matches support, the most probable first, without rivals of their own.
         frame: the map's own frame.
-        cameras: of the images, as keypoints were extracted.
+        cameras: of the images, as keypoints were extracted; an assumed focal length is refined with the pose.
+        cameras_from: which camera each is and why, see `QueryImage.camera_from`; "assumed: ..." if it is not known.
         images: the images themselves.
         joint: the result in the world: metres, z up.
     """
@@ -184,6 +61,7 @@ class Localized:
     rivals: tuple[Localized, ...] = ()
     frame: MapFrame = field(default=IDENTITY, repr=False)
     cameras: tuple[Camera, ...] = field(default=(), repr=False)
+    cameras_from: tuple[str, ...] = field(default=(), repr=False)
     images: tuple[QueryImage, ...] = field(default=(), repr=False)
     joint: JointLocalization | None = field(default=None, repr=False)
 
@@ -195,7 +73,8 @@ class Localized:
         names = tuple(image.name for image in images)
         unit = frame.world_from_map.scale
         values: dict[str, Any] = {"names": names, "frame": frame, "images": tuple(images), "joint": joint}
-        values["cameras"] = tuple(image.camera for image in images)
+        values["cameras"] = tuple(look.camera for look in joint.looks)
+        values["cameras_from"] = tuple(image.camera_from for image in images)
         values |= {"n_matches": joint.n_matches, "n_inliers": joint.n_inliers}
         contradiction = ""
         if joint.turn_error_deg:
@@ -235,7 +114,13 @@ class Localized:
         matches = f"{self.n_inliers} inliers, {self.n_matches} matches"
         rivals = "" if not self.rivals else f" (of rivals at most {self.rivals[0].probability:.3f})"
         doubt = self.reason and f"; {self.reason}"
-        return f"({at}), probability {self.probability:.3f}{rivals}; {matches}{doubt}"
+        return f"({at}), probability {self.probability:.3f}{rivals}; {matches}{doubt}{self._describe_camera()}"
+
+    def _describe_camera(self) -> str:
+        """State the focal length of an assumed camera, and what it was assumed to be."""
+        if not self.cameras_from or not self.cameras_from[0].startswith("assumed"):
+            return ""
+        return f"; camera {self.cameras_from[0]}, refined to {self.cameras[0].colmap.mean_focal_px:.0f} px"
 
     def without_images(self) -> Localized:
         """Return the result without the images and `joint`, which take megabytes."""
@@ -267,6 +152,8 @@ class Localized:
                 "n_rivals": len(self.rivals),
                 "rival_probability": rival,
                 "reason": self.reason,
+                "camera_from": self.cameras_from or "",
+                "focal_px": [camera.colmap.mean_focal_px for camera in self.cameras] or np.nan,
                 **self.frame.angle_columns,
             }
         )

@@ -162,7 +162,7 @@ class WhereToLook:
         self,
         images: Image | Sequence[Image],
         turns: str | Path | ArrayLike | None = None,
-        camera: Camera | str | int | None = None,
+        camera: Camera | str | Path | int | None = None,
         prior: Sequence[float] | None = None,
         accuracy: Accuracy = ACCURACY,
     ) -> Localized:
@@ -171,14 +171,13 @@ class WhereToLook:
         Args:
             images: files, or arrays (H, W, 3) uint8 RGB.
             turns: rotations `cam_from_rig` (N, 3, 3) of several images, or a file of them.
-            camera: of the images, or its camera_id in the model; None for the model's, or a pinhole of the EXIF focal
-                length.
+            camera: of the images, its camera_id in the model, or a file of the cameras of images; None to assume one, see
+                `QueryImages`.
             prior: rough x, y, z of the camera, and perhaps yaw in degrees: one more hypothesis.
             accuracy: limits in metres and degrees that the probability refers to.
 
         Raises errors as `wheretolook.select.image_localizer.ImageLocalizer.open` and `.localize`.
         """
-        camera = parse_camera(camera) if isinstance(camera, str) else camera
         return self._localizer.localize(images, turns, camera, prior, accuracy)
 
     def next_look(

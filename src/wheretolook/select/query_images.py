@@ -1,0 +1,207 @@
+"""Reads images to localize: their pixels as the map reads its own, and their cameras, known or assumed."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from wheretolook.geometry.camera import (
+    Camera,
+    PinholeCamera,
+    camera_of,
+    describe_camera,
+    parse_camera,
+    read_named_cameras,
+    turn_camera,
+)
+from wheretolook.localization.rig import FocalPrior
+from wheretolook.mapping.colmap_model import find_camera
+from wheretolook.mapping.map import Map, reads_upright
+from wheretolook.mapping.photographs import exif_focal_px, quarters_upright, read_photograph, reduce_photograph
+from wheretolook.utils.errors import ConfigError, PoseError
+from wheretolook.utils.files import path_ends
+
+KnownCamera = Camera | Mapping[str, Camera]  # of all images, or by their names
+
+
+@dataclass(frozen=True, eq=False)
+class QueryImage:
+    """An image to localize, as its keypoints are extracted, and its camera.
+
+    Attributes:
+        name: of the image.
+        rgb: (H, W, 3) uint8, with the axes of the pose.
+        camera: of that size.
+        camera_from: what the camera is: "given", "listed", "mapping image NAME"; or "assumed: ..." with the camera of the
+            map or the EXIF focal length.
+        focal: what is assumed of its focal length; None if the camera is known.
+        quarters: quarter turns to the left that make the image upright by its EXIF data.
+        is_turned: whether keypoints are extracted from the image turned so.
+        others: further readings of the image, if it is uncertain how its camera was held.
+    """
+
+    name: str
+    rgb: NDArray[np.uint8]
+    camera: Camera
+    camera_from: str = "given"
+    focal: FocalPrior | None = None
+    quarters: int = 0
+    is_turned: bool = False
+    others: tuple[QueryImage, ...] = ()
+
+
+class QueryImages:
+    """Reads images to localize in a map, opened from a COLMAP model.
+
+    Pixels are those as stored, as COLMAP and hloc read them, or upright by EXIF if the map's are; if only the other
+    reading has the proportions of the camera, it is taken.
+
+    The camera of an image is the given or listed one, or that of the mapping image of the same name. Otherwise it is
+    assumed to be one of the map of the same proportions, also if it was turned by a quarter, or without any a pinhole of
+    the EXIF focal length.
+    """
+
+    def __init__(self, opened: Map) -> None:
+        assert opened.path is not None and opened.images is not None
+        self.folder = opened.path
+        self.cameras = opened.cameras
+        ids = opened.images.image_cameras.tolist()
+        self.by_name = {name: self.cameras[i] for name, i in zip(opened.images.image_names, ids, strict=True)}
+        self.upright = reads_upright(opened.path)
+
+    def known_camera(self, camera: Camera | int | str | Path | None) -> KnownCamera | None:
+        """Return a camera, given as one, by its camera_id, as a text, or as a file of the cameras of images.
+
+        Raises MapError if the model has no such camera, ConfigError or TableError if the text or the file has none.
+        """
+        if isinstance(camera, Path) or (isinstance(camera, str) and Path(camera).is_file()):
+            return read_named_cameras(Path(camera))
+        if isinstance(camera, str):
+            return parse_camera(camera)
+        if camera is not None and not isinstance(camera, (int, Camera)):
+            fix = "Give a Camera, a camera_id of the model, or a file of cameras."
+            raise ConfigError("this is no camera", value=camera, fix=fix)
+        return None if camera is None else find_camera(self.cameras, self.folder, camera)
+
+    def read(self, image: str | Path | NDArray[np.uint8], name: str, camera: KnownCamera | None = None) -> QueryImage:
+        """Read a file, or take an array (H, W, 3) uint8 RGB, of a given or known camera.
+
+        Raises MapError if the file cannot be read, PoseError for an array that is no image, ConfigError if the camera
+        is unknown or has other proportions.
+        """
+        path = None if isinstance(image, np.ndarray) else Path(image)
+        known, known_from = self._known(path, name, camera)
+        if isinstance(image, np.ndarray):
+            if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3 or 0 in image.shape:
+                raise PoseError("an image is an array (H, W, 3) uint8", value=(image.shape, str(image.dtype)))
+            readings = [image]
+        else:
+            readings = [read_photograph(Path(image), self.upright)]
+            if quarters_upright(Path(image)):
+                readings.append(read_photograph(Path(image), not self.upright))
+        if known_from.startswith("mapping image") and not any(_has_proportions(known, rgb) for rgb in readings):
+            known = None  # another image of this name
+        candidates = [*self.cameras.values()] if known is None else [known]
+        fitting = [rgb for rgb in readings if any(_has_proportions(one, rgb) for one in candidates)]
+        rgb = (fitting or readings)[0]
+        quarters = 0 if path is None or self.upright is (rgb is readings[0]) else quarters_upright(path) % 4
+        if known is not None and fitting:
+            return replace(_fitted(name, rgb, known, known_from), quarters=quarters)
+        if known is not None:
+            problem = f"the image of {_size(rgb)} has other proportions than the camera"
+            raise ConfigError(problem, path=path, value=describe_camera(known), fix="Correct --camera.")
+        return replace(self._assumed(path, name, rgb), quarters=quarters)
+
+    def _known(self, path: Path | None, name: str, given: KnownCamera | None) -> tuple[Camera | None, str]:
+        """Return the camera that was given or listed, or that of the mapping image of the same name.
+
+        Names are the longest ends of the path that are known, at least the file name.
+        """
+        ends = path_ends(Path(name) if path is None else path.absolute())
+        if isinstance(given, Mapping):
+            listed = next((given[end] for end in ends if end in given), None)
+            if listed is None:
+                raise ConfigError("the list of cameras does not name this image", path=path, value=name)
+            return listed, "listed"
+        if given is not None or path is None:
+            return given, "given"
+        found = next((end for end in ends if end in self.by_name), None)
+        return (None, "") if found is None else (self.by_name[found], f"mapping image {found}")
+
+    def _assumed(self, path: Path | None, name: str, rgb: NDArray[np.uint8]) -> QueryImage:
+        """Assume the camera of an image: one of the map, whatever the EXIF data say, or a pinhole by these."""
+        height, width = rgb.shape[:2]
+        in_exif = None if path is None else exif_focal_px(path)
+        cameras = {number: one for number, one in self.cameras.items() if _has_proportions(one, rgb)}
+        turns = [0]
+        if not cameras:
+            sideways = np.swapaxes(rgb, 0, 1)
+            cameras = {number: one for number, one in self.cameras.items() if _has_proportions(one, sideways)}
+            turns = [1, 3]
+        if not cameras and in_exif is not None:
+            focal = FocalPrior((in_exif,), (0.03,))  # whole millimetres; crops and resized photographs
+            return _fitted(name, rgb, PinholeCamera(width, height, in_exif), "assumed: EXIF focal length", focal)
+        if not cameras:
+            problem = f"the camera of this image of {_size(rgb)} is unknown: it has no EXIF focal length,"
+            problem += " and the map has no camera of its proportions"
+            fix = "Give --camera MODEL,width,height,parameters, in Python camera."
+            raise ConfigError(problem, path=path, fix=fix)
+        longer = max(width, height)
+        focal_px = {n: one.colmap.mean_focal_px * longer / max(one.width, one.height) for n, one in cameras.items()}
+        expected = float(np.median([*focal_px.values()])) if in_exif is None else in_exif
+        number = min(focal_px, key=lambda n: abs(np.log(focal_px[n] / expected)))
+        values = [focal_px[number]]
+        for value in (min(focal_px.values()), max(focal_px.values())):
+            if all(abs(np.log(value / other)) > 0.01 for other in values):
+                values.append(value)
+        deviations = [0.0] * len(values)
+        if in_exif is not None and abs(np.log(in_exif / values[0])) > 0.05:
+            values.append(in_exif)
+            deviations.append(0.03)
+        focal = FocalPrior(tuple(values), tuple(deviations))
+        source = f"assumed: camera {number} of the map"
+        source += ", turned by 90 degrees" if turns[0] else ""
+        readings = {turn_camera(cameras[number], turn): None for turn in turns}
+        first, *others = (_fitted(name, rgb, camera, source, focal) for camera in readings)
+        return replace(first, others=tuple(others))
+
+
+def distinct_names(paths: Sequence[Path]) -> list[str]:
+    """Return the names of files, or where some are equal, the paths from the folder that has all."""
+    names = [path.name for path in paths]
+    if len({*names}) == len(names):
+        return names
+    folder = os.path.commonpath([path.absolute().parent for path in paths])
+    return [os.path.relpath(path, folder) for path in paths]
+
+
+def _size(rgb: NDArray[np.uint8]) -> str:
+    return f"{rgb.shape[1]} x {rgb.shape[0]} px"
+
+
+def _has_proportions(camera: Camera, rgb: NDArray[np.uint8]) -> bool:
+    """Return whether an image has the proportions of a camera, within 1 %."""
+    height, width = rgb.shape[:2]
+    return 0.99 <= width * camera.height / (height * camera.width) <= 1.01
+
+
+def _fitted(
+    name: str, rgb: NDArray[np.uint8], camera: Camera, camera_from: str, focal: FocalPrior | None = None
+) -> QueryImage:
+    """Reduce an image to the size of its camera, at most 1,600 px; return it with the camera and prior of that size."""
+    reduced = reduce_photograph(rgb, min(1600, max(camera.width, camera.height)))
+    height, width = reduced.shape[:2]
+    if focal is not None:
+        ratio = max(width, height) / max(rgb.shape[:2])
+        focal = replace(focal, focal_px=tuple(value * ratio for value in focal.focal_px))
+    if (width, height) != (camera.width, camera.height):
+        scaled = pycolmap.Camera(**camera.colmap.record())
+        scaled.rescale(width, height)
+        camera = camera_of(scaled.model_name, width, height, scaled.params)
+    return QueryImage(name, reduced, camera, camera_from, focal)

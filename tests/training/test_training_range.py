@@ -87,3 +87,14 @@ def test_views_without_landmarks_have_no_range():
     assert TrainingRange.of(views_at([[], []])).bounds == {}
     with pytest.raises((TypeError, IndexError, ValueError)):
         TrainingRange.of_record({"in_view": [1.0]})
+
+
+def test_each_view_names_the_quantities_that_are_out_of_range():
+    known = TrainingRange({"distance_m": (0.4, 16.0), "focal_px": (100.0, 1000.0)})
+    quantities = np.full((3, 6), np.nan)
+    quantities[:, 0] = 2.0, 20.0, np.nan
+    quantities[:, 5] = 500.0, 500.0, 2000.0
+    inside, far, fine = known.texts(quantities)
+    assert inside == "" and "20" in far and "0.4 to 16" in far and "pixel" not in far
+    # an angle: arctan(1 / 2000) is 0.0286 degrees, and 1000 to 100 px are 0.0573 to 0.573 degrees
+    assert "0.029 degrees (in range: 0.0573 to 0.573)" in fine

@@ -133,13 +133,14 @@ def finish(command: SelectorOptions, selector: WhereToLook, views: Views, given:
     best = views.rank == 1
     kind, scores = ("best scores", views.score) if views.set_score is None else ("set scores", views.set_score)
     print(f"{locations}: {n_used}{skipped}; {kind} {scores[best].min():.3g} to {scores[best].max():.3g}")
-    counts = {
-        "no visible landmark": views.n_visible[best] == 0,
-        "outside the training distribution (column in_range)": ~views.in_range[best],
-    }
+    outside = "outside the training distribution (column in_range)"
+    counts = {"no visible landmark": views.n_visible[best] == 0, outside: ~views.in_range[best]}
     for what, rows in counts.items():
         if rows.any():
-            print(f"best views, {what}: {rows.sum()} of {len(rows)}")
+            text = f"best views, {what}: {rows.sum()} of {len(rows)}"
+            if rows is counts[outside] and views.out_of_range is not None:
+                text += f", by {views.out_of_range[best][rows][0]}"
+            print(text)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -52,6 +52,7 @@ WRITTEN = {
     "n_too_oblique": "",
     "n_repeated": ".0f",
     "in_range": "",
+    "out_of_range": "",
     "camera_id": "",
 }
 """Columns that tables of views have in this order, if they are known, and how their floats are written."""
@@ -85,6 +86,7 @@ class Views:
     n_visible: Column = None  # (V,) visible landmarks
     camera_id: Column = None  # (V,) in the model, where views have several cameras
     in_range: Column = None  # (V,) whether the view is within the training distribution of the scorer
+    out_of_range: Column = None  # (V,) quantities that are not, with their values and ranges
     # (V,) mean errors of a pose at the right place
     expected_error_m: Column = None
     expected_error_deg: Column = None

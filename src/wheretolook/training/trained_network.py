@@ -29,7 +29,7 @@ QUANTITIES = {
     "in_view": "{:.0f} landmarks in view",
     "across_deg": "field of view across {:.1f} degrees",
     "down_deg": "field of view down {:.1f} degrees",
-    "focal_px": "focal length {:.4g} px",
+    "focal_px": "angle of a pixel {:.2g} degrees",
 }
 """Quantities of a view, NaN where unknown, and their text in messages. The mean distance is geometric."""
 
@@ -129,12 +129,25 @@ class TrainingRange:
         if n_outside <= tolerated * len(outside):
             return ""
         parts = []
-        for column, (name, text) in enumerate(QUANTITIES.items()):
+        for column, name in enumerate(QUANTITIES):
             if outside[:, column].any():
-                low, high = self.bounds[name]
-                value = np.median(with_landmarks[outside[:, column], column])
-                parts.append(f"{text.format(value)} (in range: {low:.3g} to {high:.3g})")
+                parts.append(self._text(name, float(np.median(with_landmarks[outside[:, column], column]))))
         return f"{n_outside} of {len(outside)} views are unlike the training views: {', '.join(parts)}"
+
+    def texts(self, quantities: Float) -> list[str]:
+        """Return the quantities outside the range of each of the views with `QUANTITIES` (B, 6), "" for views within."""
+        texts = []
+        for values, outside in zip(quantities.tolist(), self.outside(quantities), strict=True):
+            named = zip(QUANTITIES, values, outside, strict=True)
+            texts.append(", ".join(self._text(name, value) for name, value, is_out in named if is_out))
+        return texts
+
+    def _text(self, name: str, value: float) -> str:
+        """Return a quantity, its value and its range; a focal length as the angle of a pixel in the middle."""
+        low, high = self.bounds[name]
+        if name == "focal_px":
+            value, low, high = (float(np.degrees(1 / focal_px)) for focal_px in (value, high, low))
+        return f"{QUANTITIES[name].format(value)} (in range: {low:.3g} to {high:.3g})"
 
 
 @dataclass

@@ -432,6 +432,7 @@ class SetScorer(LandmarkScorer):
         errors = np.empty((n, 2))
         n_visible = np.zeros(n, dtype=np.int64)
         in_range = np.full(n, self._serves_camera)
+        out_of_range = np.full(n, "", dtype=object)
         for rows, described, visible in self.describer.in_blocks(cam_from_world, MAX_LANDMARKS):
             views = self.network.sums_of(described, visible)
             score[rows] = probabilities(self.trained, self.accuracy, views)
@@ -439,6 +440,8 @@ class SetScorer(LandmarkScorer):
             errors[rows] = AccuracyModel.bundled().expected_errors(statistics_of(self.network, views))
             n_visible[rows] = visible.cpu().numpy()
             in_range[rows] &= self._in_range(described, visible)
+            out_of_range[rows] = self.training_range.texts(view_quantities(described, visible, self._of_camera))
+        out_of_range[~in_range & (out_of_range == "")] = "triangulation angles of the landmarks"
         return Views(
             cam_from_world,
             self.localization_map.camera,
@@ -447,6 +450,7 @@ class SetScorer(LandmarkScorer):
             expected_inliers=expected_inliers,
             n_visible=n_visible,
             in_range=in_range,
+            out_of_range=out_of_range,
             expected_error_m=errors[:, 0],
             expected_error_deg=errors[:, 1],
         )

@@ -110,9 +110,9 @@ def _leaves_map(source: PhotographedMap, held_out: NDArray[np.int64], n_landmark
     return False
 
 
-def _check_count(source: PhotographedMap, n_blocks: int) -> None:
-    """Raise MapError for fewer than two blocks."""
-    if n_blocks < 2:
+def _check_count(source: PhotographedMap, n_blocks: int, n_needed: int = 2) -> None:
+    """Raise MapError for fewer blocks than `n_needed`."""
+    if n_blocks < n_needed:
         problem = f"without a block of neighbouring photographs fewer than {MIN_LANDMARKS} landmarks are left"
         fix = "Take more photographs, each part of the scene from several sides, and map them all."
         raise MapError(problem, path=source.path, value=f"{len(source.poses)} photographs", fix=fix)
@@ -266,7 +266,7 @@ def hold_out_blocks(
             bar.update(len(job.block.tested))
     shutil.rmtree(model, ignore_errors=True)
     finished = [result for result in results.values() if result is not None]
-    _check_count(source, len(finished))
+    _check_count(source, len(finished), min(2, len(blocks)))
     return finished
 
 

@@ -11,8 +11,6 @@ from typing import Any
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from tqdm.auto import tqdm
 
 from wheretolook.features.extractor import DescriptorKind, Stored, kind_of
@@ -213,6 +211,9 @@ def _connected(database: Path, n: int) -> int:
     verified = [pair for pair, number in zip(pair_ids, n_inliers, strict=True) if number >= _MIN_INLIERS]
     pairs = [pycolmap.pair_id_to_image_pair(pair) for pair in verified]
     rows, columns = np.array(pairs, dtype=np.int64).reshape(-1, 2).T - 1
+    from scipy.sparse import coo_array  # takes longer than all of --help
+    from scipy.sparse.csgraph import connected_components
+
     graph = coo_array((np.ones(len(rows)), (rows, columns)), shape=(n, n))
     return int(np.bincount(connected_components(graph, directed=False)[1]).max())
 

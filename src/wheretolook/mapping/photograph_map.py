@@ -206,14 +206,14 @@ def _reconstruct(database: Path, folder: Path, cameras: PhotographCameras, seed:
 
 def _connected(database: Path, n: int) -> int:
     """Return how many of n photographs are connected by pairs with enough verified matches to place one by another."""
+    from scipy.sparse import coo_array  # takes longer than all of --help
+    from scipy.sparse.csgraph import connected_components
+
     with pycolmap.Database.open(str(database)) as db:
         pair_ids, n_inliers = db.read_two_view_geometry_num_inliers()
     verified = [pair for pair, number in zip(pair_ids, n_inliers, strict=True) if number >= _MIN_INLIERS]
     pairs = [pycolmap.pair_id_to_image_pair(pair) for pair in verified]
     rows, columns = np.array(pairs, dtype=np.int64).reshape(-1, 2).T - 1
-    from scipy.sparse import coo_array  # takes longer than all of --help
-    from scipy.sparse.csgraph import connected_components
-
     graph = coo_array((np.ones(len(rows)), (rows, columns)), shape=(n, n))
     return int(np.bincount(connected_components(graph, directed=False)[1]).max())
 

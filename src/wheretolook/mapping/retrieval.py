@@ -6,7 +6,6 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.cluster.vq import kmeans2
 
 from wheretolook.features.extractor import DescriptorKind, Stored
 from wheretolook.mapping.triangulation import choose_pairs
@@ -46,6 +45,8 @@ def global_descriptors(stored: Sequence[Stored], kind: DescriptorKind, n_words: 
     It is VLAD (Jegou et al., CVPR 2010) with normalized words (Arandjelovic and Zisserman, CVPR 2013) that are trained
     on these images.
     """
+    from scipy.cluster.vq import kmeans2  # takes longer than all of --help
+
     n_sampled = max(100, 20_000 // len(stored))  # of each image: k-means takes seconds
     rng = np.random.default_rng(0)
     samples = [descriptors[rng.permutation(len(descriptors))[:n_sampled]] for _, descriptors in stored]

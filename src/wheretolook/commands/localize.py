@@ -99,7 +99,7 @@ class Localize(CameraOptions, FrameOptions):
 
     def __post_init__(self) -> None:
         self.frame_options()
-        self.named_camera()
+        self._query_camera()
         checked_accuracy(self.accuracy)
         if self.figure is not None and self.figure.suffix:
             check_choice("format of figures", self.figure.suffix[1:].lower(), KINDS)
@@ -111,11 +111,11 @@ class Localize(CameraOptions, FrameOptions):
     def _extractor(self) -> ExtractorConfig | None:
         return None if self.extractor is None else ExtractorConfig(self.extractor, weights=self.extractor_weights)
 
-    def named_camera(self) -> Camera | int | Path | None:
+    def _query_camera(self) -> Camera | int | Path | None:
         """Return the camera of all images, its camera_id, or the file of the cameras of images."""
         if self.camera is not None and self.camera_id is None and Path(self.camera).is_file():
             return Path(self.camera)
-        return super().named_camera()
+        return self.named_camera()
 
     def run(self) -> list[Localized]:
         """Localize the images, write `out` and `figure`, and print a summary."""
@@ -178,7 +178,7 @@ class Localize(CameraOptions, FrameOptions):
 
         if self.prior is not None:
             PosePrior.of(self.prior, localizer.frame.world_from_map)
-        camera = localizer.images.known_camera(self.named_camera())
+        camera = localizer.images.known_camera(self._query_camera())
         if self.turns is not None or len(paths) == 1:
             yield localizer.localize(paths, self.turns, camera, self.prior, self.accuracy)
             return

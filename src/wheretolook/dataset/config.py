@@ -44,7 +44,10 @@ def checked_accuracy(accuracy: Sequence[float], distances_m: ArrayLike = ()) -> 
         limits = ()
     if len(limits) != 2 or not all(limit > 0 for limit in limits):
         raise ConfigError("an accuracy has two positive limits", value=accuracy, fix="Give metres,degrees: 0.05,0.4.")
-    if np.size(distances_m) and limits[0] > (depth_m := float(np.median(distances_m))) / 2:
+    if (
+        np.size(distances_m)
+        and limits[0] > (depth_m := float(np.median(np.asarray(distances_m, dtype=np.float64)))) / 2
+    ):
         text = f"an accuracy of {limits[0]:g} m exceeds half the map's median depth of {depth_m:.2g} m; limits are in metres"
         warnings.warn(f"{text} and degrees: 5 cm and 0.4 degrees are 0.05,0.4", MapWarning, stacklevel=2)
     return limits

@@ -149,15 +149,16 @@ class TsdfVolume:
         """Average a depth image into the field. Raises ConfigError if the volume has outgrown the memory."""
         import open3d as o3d
 
+        tensor: Any = o3d.core.Tensor
         depth = image.readings(self.config.max_depth_m)
         rows, columns = (side // 4 * 4 for side in depth.shape)  # Open3D looks for blocks at every fourth pixel
         if not depth[:rows:4, :columns:4].any():
             return  # Open3D would raise
         pose = np.vstack([poses_from(image.cam_from_world, self.origin), (0, 0, 0, 1)])
-        shown = o3d.t.geometry.Image(o3d.core.Tensor(np.ascontiguousarray(depth)))
+        shown = o3d.t.geometry.Image(tensor(np.ascontiguousarray(depth)))
         view = {
-            "intrinsic": o3d.core.Tensor(image.camera.matrix),
-            "extrinsic": o3d.core.Tensor(pose),
+            "intrinsic": tensor(image.camera.matrix),
+            "extrinsic": tensor(pose),
             "depth_scale": 1.0,
             "depth_max": float(self.config.max_depth_m),
             "trunc_voxel_multiplier": float(self.config.truncation_voxels),

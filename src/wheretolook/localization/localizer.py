@@ -186,7 +186,7 @@ class Localizer:
                 pixels = camera.project(transform(images.image_poses[row], self.landmarks.points[seen]))
                 distance, nearest = cKDTree(keypoints.pixels).query(np.nan_to_num(pixels, nan=-1e6))
                 cosine = (unit_descriptors(self._descriptors[seen]) * keypoints.descriptors[nearest]).sum(1)
-                n_found += np.count_nonzero((distance < 1.5) & (cosine >= self.kind.min_similarity))  # pixels
+                n_found += int(np.sum((distance < 1.5) & (cosine >= self.kind.min_similarity)))  # pixels
         if n_seen < 20:
             return False
         if n_found < 0.1 * n_seen:  # of images of another size still a quarter

@@ -174,7 +174,7 @@ def _record_starts(
 
     Raises MapError if they do not fill the file, or one begins as the one before it, as in a file of zeros.
     """
-    buffer = memoryview(data)
+    buffer = data.data
     starts = [_UINT64.size]
     head = b""
     try:

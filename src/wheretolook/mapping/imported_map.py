@@ -204,7 +204,7 @@ def _keypoints_found(image: Any, path: Path, turned: bool) -> int:
     keypoints = np.array([point.xy for point in image.points2D if point.has_point3D()]).reshape(-1, 2)
     rgb = read_photograph(path, turned)
     rgb = reduce_photograph(rgb, max(image.camera.width, image.camera.height))
-    detected = cv2.SIFT_create(nfeatures=1000).detect(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), None)
+    detected = cv2.SIFT.create(nfeatures=1000).detect(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), None)
     if not detected or not len(keypoints):
         return 0
     distance, _ = cKDTree([np.add(one.pt, 0.5) for one in detected]).query(keypoints, distance_upper_bound=1.5)

@@ -292,7 +292,8 @@ def path_views(path: PlannedPath, localization_map: LocalizationMap, renderer: R
     camera = localization_map.camera
     points = localization_map.landmarks.points
     pixels = []
-    for pose, rows in zip(views.cam_from_world, localization_map.landmarks_in_view(views.cam_from_world), strict=True):
-        pixels.append(camera.project(transform(pose, points[rows])))
+    visible = localization_map.landmarks_in_view(views.cam_from_world)
+    for row, pose in enumerate(views.cam_from_world):
+        pixels.append(camera.project(transform(pose, points[visible[row]])))
     images = None if renderer is None else renderer.render(camera, views.cam_from_world).rgb
     return replace(views, camera=camera, pixels=tuple(pixels), images=images)

@@ -72,7 +72,10 @@ def load_mesh(path: str | PathLike[str], up: str = "z", colored: bool = True) ->
         source: Any = {".glb": _with_float_positions, ".obj": _with_positive_indices}.get(file.suffix.lower(), str)(
             file
         )
-        named = {"file_type": file.suffix[1:].lower(), "resolver": trimesh.resolvers.FilePathResolver(str(file))}
+        named: dict[str, Any] = {
+            "file_type": file.suffix[1:].lower(),
+            "resolver": trimesh.resolvers.FilePathResolver(str(file)),
+        }
         scene = trimesh.load_scene(source, process=False, **({} if source == str(file) else named))
         parts = list(_parts(scene))
     except Exception as error:  # trimesh's parsers raise errors of many kinds

@@ -138,7 +138,7 @@ class ImageLocalizer:
         images = opened.images
         assert images is not None
         folder = find_photographs(self.images.folder)
-        photographs = []
+        photographs: list[Any] = []
         for row in np.argsort(-np.bincount(images.observation_image, minlength=len(images.image_ids)), kind="stable"):
             name = images.image_names[row]
             if folder is not None and len(photographs) < 2 and has_image(folder, name):

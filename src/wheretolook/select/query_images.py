@@ -105,7 +105,8 @@ class QueryImages:
             readings = [read_photograph(Path(image), self.upright)]
             if quarters_upright(Path(image)):
                 readings.append(read_photograph(Path(image), not self.upright))
-        if known_from.startswith("mapping image") and not any(_has_proportions(known, rgb) for rgb in readings):
+        by_name = known is not None and known_from.startswith("mapping image")
+        if known is not None and by_name and not any(_has_proportions(known, rgb) for rgb in readings):
             known = None  # another image of this name
         candidates = [*self.cameras.values()] if known is None else [known]
         fitting = [rgb for rgb in readings if any(_has_proportions(one, rgb) for one in candidates)]

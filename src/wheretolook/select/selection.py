@@ -130,9 +130,9 @@ class Candidates:
         points = tqdm(self.waypoints.points, desc="looks", unit="waypoint", disable=not progress)
         for point, scores in zip(points, self.scores, strict=True):
             choice = self.axes[np.isfinite(scores)]
-            views = best_views(self.scorer, point, choice, scores[np.isfinite(scores)], n, max_turn_deg)
-            chosen.extend(choice[[*views.rows]])
-            set_scores.append(views.score)
+            best = best_views(self.scorer, point, choice, scores[np.isfinite(scores)], n, max_turn_deg)
+            chosen.extend(choice[[*best.rows]])
+            set_scores.append(best.score)
         rows = np.repeat(np.arange(len(set_scores)), n)
         poses = poses_looking_along(self.waypoints.points[rows], np.array(chosen))
         views = reported(self.scorer, self.waypoints, rows, poses)

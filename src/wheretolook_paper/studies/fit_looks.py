@@ -81,7 +81,7 @@ def main(scenes: tuple[Path, ...], places: int = 60, draws: int = 4) -> None:
         draws: sets of each number of views at a location.
     """
     sets = pd.concat([drawn_sets(SceneFolder(folder, "val"), places, draws) for folder in scenes], ignore_index=True)
-    probability = np.clip(1 - sets["failed"].to_numpy(), set_score.MIN_PROBABILITY, 1 - set_score.MIN_PROBABILITY)
+    probability = np.clip(1 - sets["failed"].to_numpy(), 1e-3, 1 - 1e-3)  # as in `SetScoreModel`
     mixed = np.log(probability / (1 - probability)) - VARIANCE * sets["log_position_variance"].to_numpy()
     fitted = report("set score", mixed[:, None], sets)
     scale = float(fitted.coef_[0, 0])

@@ -8,7 +8,7 @@ import pandas as pd
 from selection.room import POINTS
 from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.geometry.views import Views
-from wheretolook.select.selection import Candidates, PoseUncertainty
+from wheretolook.select.selection import PoseUncertainty, ScoredDirections
 from wheretolook.select.waypoints import Waypoints
 
 FREE_TO_X = 5.0  # beyond is geometry
@@ -18,7 +18,7 @@ def expected(prior, score):
     """Compute expected scores of a view along x at the origin, where only the direction y is allowed."""
     occlusion = SimpleNamespace(inside_geometry=lambda points: points[:, 0] > FREE_TO_X)
     scorer = SimpleNamespace(score_directions=score, localization_map=SimpleNamespace(occlusion=occlusion))
-    candidates = Candidates(scorer, Waypoints.of((0, 0, 0)), np.array([[0.0, 1.0, 0.0]]), np.ones((1, 1)))
+    candidates = ScoredDirections(scorer, Waypoints.of((0, 0, 0)), np.array([[0.0, 1.0, 0.0]]), np.ones((1, 1)))
     views = prior.with_expected_scores(
         Views(poses_looking_along([(0, 0, 0)], [(1, 0, 0)]), waypoint=np.array([0])), candidates
     )

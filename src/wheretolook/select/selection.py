@@ -44,7 +44,7 @@ def select_views(
     allowed = _within_pan(axes, waypoints, world_from_map.rotation, request)
     waypoints = replace(waypoints, points=world_from_map.apply(waypoints.points))
     scores = _scores(scorer, waypoints.points, axes, progress)
-    candidates = Candidates(scorer, waypoints, axes, np.where(allowed, scores, -np.inf))
+    candidates = ScoredDirections(scorer, waypoints, axes, np.where(allowed, scores, -np.inf))
     if request.looks is None:
         views = candidates.best(request)
     elif request.least_score is None:
@@ -95,7 +95,7 @@ def _scores(scorer: Scorer, locations: Float, axes: Float, progress: bool) -> Fl
 
 
 @dataclass(frozen=True, eq=False)
-class Candidates:
+class ScoredDirections:
     """Directions at W waypoints, whose points are in the world, and their scores.
 
     `axes` (D, 3) are unit vectors in the world, `scores` (W, D) of views along them; -inf where one is not allowed.
@@ -225,7 +225,7 @@ class PoseUncertainty:
         rotations[:, 0, 1] = -rotations[:, 1, 0]
         return offsets, rotations
 
-    def with_expected_scores(self, views: Views, candidates: Candidates, progress: bool = False) -> Views:
+    def with_expected_scores(self, views: Views, candidates: ScoredDirections, progress: bool = False) -> Views:
         """Return views in the world with their expected scores, and the highest ones of all candidates there.
 
         They are means over draws of the true pose outside geometry, while the robot turns by its estimate; of the

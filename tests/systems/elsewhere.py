@@ -16,7 +16,9 @@ from types import ModuleType
 POSIX_ONLY = ["fcntl", "resource", "termios", "pwd", "grp", "pty"]
 KEEP = {"SIGINT", "SIGTERM", "SIGABRT", "SIGFPE", "SIGILL", "SIGSEGV"}  # which Windows has
 OF_SIGNALS = ["alarm", "setitimer", "getitimer", "ITIMER_REAL", "pthread_kill", "pthread_sigmask", "sigwait", "SIG_BLOCK", "SIG_UNBLOCK"]  # fmt: skip
-OF_OS = ["sched_getaffinity", "sched_setaffinity", "pread", "pwrite", "O_NOFOLLOW", "O_NONBLOCK"]
+OF_OS = ["sched_getaffinity", "sched_setaffinity", "pread", "pwrite", "O_NOFOLLOW"]
+if sys.version_info < (3, 13):
+    OF_OS.append("O_NONBLOCK")  # which shutil needs on POSIX since
 
 msvcrt = ModuleType("msvcrt")
 msvcrt.LK_NBLCK = 2

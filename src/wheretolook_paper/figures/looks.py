@@ -17,7 +17,6 @@ from wheretolook.dataset.config import THRESHOLDS
 from wheretolook.figures.floor_plan import BLUE, GREY, INK, RC, VERMILION, new_figure
 from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.poses import Float, pose_error
-from wheretolook.localization.confidence import ConfidenceModel
 from wheretolook.localization.localizer import Localizer
 from wheretolook.localization.rig import Look, rig_of
 from wheretolook.localization.rig_localization import JointLocalization, JointLocalizer
@@ -179,7 +178,7 @@ def _estimate(pose: JointLocalization, views: Sequence[Look], true: Float) -> Es
     if pose.cams_from_world is None:
         return Estimate(None, pixels, 0.0, np.inf, np.inf)
     error_m, error_deg = pose_error(pose.cams_from_world, true)
-    probability = float(ConfidenceModel.bundled().of(pose))
+    probability = pose.probability()
     return Estimate(pose.cams_from_world, pixels, probability, float(error_m.max()), float(error_deg.max()))
 
 

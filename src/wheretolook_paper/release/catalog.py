@@ -16,7 +16,8 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from wheretolook.dataset.layout import Dataset
-from wheretolook.evaluation.results import CALIBRATION_CSV, SCORES_CSV, read_scores
+from wheretolook.evaluation.config import CALIBRATION_CSV, SCORES_CSV
+from wheretolook.evaluation.results import read_scores
 from wheretolook.evaluation.statistics import read_calibration
 from wheretolook.figures.floor_plan import save_figure
 from wheretolook.scorers.weights import load_scorer

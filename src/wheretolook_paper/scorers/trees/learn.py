@@ -29,7 +29,7 @@ from wheretolook.scorers.set.score import LandmarkScorer
 from wheretolook.training.data import check_classes, labelled_rows, validation_views
 from wheretolook.training.fit import home_device
 from wheretolook.training.learner import TrainingJob, TrainingResult, class_counts, fit_platt
-from wheretolook.training.scenes import training_scenes
+from wheretolook.training.provenance import training_scenes
 from wheretolook.training.trained_network import TrainingRange, camera_quantities, view_quantities
 from wheretolook.training.weights import check_method_of_weights, read_weights, write_weights
 from wheretolook.utils.errors import ConfigError, WeightsError

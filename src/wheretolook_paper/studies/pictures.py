@@ -64,7 +64,7 @@ TABLES = {
 TABLE_SIZE = 1200, 620
 PLOT_SIZE = 1075, 575
 SCATTER_SIZE = 1075, 610
-VIEWER_SIZE = 1400, 960
+VIEWER_SIZE = 1700, 960  # the panel leaves the room in the middle free
 LOAD_S = 180  # until a page is complete
 LEFT, TOP = 206, 14
 """Where the pages of MLflow begin, right of its menu."""

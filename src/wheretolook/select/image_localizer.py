@@ -1,10 +1,10 @@
-"""Reads hloc's files of image pairs: the mapping images that retrieval found for each query."""
+"""Localizes images in a COLMAP model, among all of its landmarks or those of retrieved mapping images (hloc's pairs)."""
 
 from __future__ import annotations
 
 import warnings
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path, PurePath
@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import csr_array
+from tqdm.auto import tqdm
 
 from wheretolook.dataset.config import ACCURACY, CONTRADICTED, LOCALIZED, Accuracy, checked_accuracy
 from wheretolook.features.extractor import EXTRACTORS, KINDS, ExtractorConfig, Keypoints, kind_of, runnable_extractors
@@ -31,7 +32,15 @@ from wheretolook.mapping.map import Map, find_features, find_photographs, has_im
 from wheretolook.mapping.map_frame import MapFrame
 from wheretolook.select.localized import Localized
 from wheretolook.select.query_images import KnownCamera, QueryImage, QueryImages, distinct_names
-from wheretolook.utils.errors import ConfigError, MapError, MapWarning, PoseError, TableError, from_record
+from wheretolook.utils.errors import (
+    ConfigError,
+    MapError,
+    MapWarning,
+    PoseError,
+    TableError,
+    WhereToLookError,
+    from_record,
+)
 from wheretolook.utils.files import path_ends, read_json_object, read_text
 
 
@@ -219,6 +228,27 @@ class ImageLocalizer:
                 readings.append(replace(query, is_turned=True))
             results += [self._localize(paths, [reading], cam_from_rig, near, limits) for reading in readings]
         return max(results, key=lambda result: (result.status in (LOCALIZED, CONTRADICTED), result.n_inliers))
+
+    def localize_each(
+        self,
+        paths: Sequence[Path],
+        names: Sequence[str],
+        camera: KnownCamera | int | str | Path | None = None,
+        prior: Sequence[float] | None = None,
+        accuracy: Accuracy = ACCURACY,
+    ) -> Iterator[Localized]:
+        """Yield the result of `localize` for each image, with a progress bar; the status "error" where that raises.
+
+        Raises ConfigError if the prior is invalid.
+        """
+        if prior is not None:
+            PosePrior.of(prior, self.frame.world_from_map)
+        for path, name in zip(tqdm(paths, desc="localize", unit="image"), names, strict=True):
+            try:
+                result = self.localize(path, None, camera, prior, accuracy, [name])
+            except WhereToLookError as error:
+                result = Localized((name,), "error", str(error), frame=self.frame)
+            yield result
 
     def _localize(
         self,

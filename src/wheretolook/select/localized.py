@@ -24,9 +24,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-FAILED = "error"  # status of an image that cannot be read, or whose camera is unknown
-
-
 @dataclass(frozen=True, eq=False)
 class Localized:
     """The pose of one image, or of N images of a rig, in the map's own frame and unit, and the rival poses.

@@ -67,7 +67,7 @@ class Localize(CameraOptions, FrameOptions):
         pitch: lowest and highest pitch in degrees of the next view.
         pan: its lowest and highest pan in degrees, to the left from the first view; by default any.
         database: COLMAP's database.db or hloc's feats-*.h5.
-        extractor: extractor for the images: opencv, colmap, aliked, disk or xfeat.
+        extractor: extractor for the images, as --mapping.extractor.method of `wheretolook map`.
         extractor_weights: weights of a learned extractor; see docs/features.md.
         pairs: hloc's file of the mapping images that retrieval found for each image, in lines "image mapping_image".
             Images are matched with the landmarks of these alone.

@@ -235,7 +235,7 @@ def _map_photographs(options: BuildMap, log: Log) -> SceneFolder:
     assert folder is not None
     scene = _new_scene(options, folder)
     _with_scene(scene, options.root)
-    tables = [path for path in (settings.scale.marker_table, settings.frame.positions) if path is not None]
+    tables = list(filter(None, (settings.scale.marker_table, settings.frame.positions)))
     for path in tables:
         if not path.is_file():
             raise ConfigError("there is no such table", path=path)

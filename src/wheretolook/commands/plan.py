@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
@@ -87,10 +87,7 @@ class Plan(SceneOrMapOptions):
         with hold(folder.with_name(f".{folder.name}.lock"), "plan", wait_s=120.0):
             written = []
             to_map = scene.frame.world_from_map.inverse
-            drawn = {
-                name: replace(along, cam_from_world=to_map.apply_to_poses(along.cam_from_world), frame=scene.frame)
-                for name, along in views.items()
-            }
+            drawn = {name: along.in_frame(scene.frame) for name, along in views.items()}
             for report in reports("plan"):
                 written += report(
                     drawn, to_map.apply(scene.landmarks.points), f"{scene.name}, {method}", folder, config.film

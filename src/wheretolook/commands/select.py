@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 import warnings
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
@@ -219,8 +219,7 @@ class Select(SelectionRequest, SelectorOptions):
         if waypoints is None:
             assert self.grid is not None
             waypoints = selector.grid(self.grid)
-        request = {field.name: getattr(self, field.name) for field in fields(SelectionRequest)}
-        views = selector.best(waypoints, progress=True, **request)
+        views = selector.select(waypoints, self, progress=True)
         finish(self, selector, views, len(waypoints), "waypoints")
         print(f"views: {len(views)} in {time.monotonic() - start:.1f} s: {self.out}")
         return views

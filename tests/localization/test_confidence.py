@@ -5,7 +5,7 @@ import pytest
 from scipy.stats import lognorm
 
 from wheretolook.dataset.config import ACCURACY
-from wheretolook.localization.confidence import RIGHT_PLACE, ConfidenceModel, ErrorModel, probabilities
+from wheretolook.localization.confidence import RIGHT_PLACE, ErrorModel
 from wheretolook.localization.rig_localization import JointLocalization
 
 
@@ -27,17 +27,16 @@ def test_the_error_is_log_normal():
 
 
 def test_a_coarser_accuracy_is_more_probable_up_to_the_right_place():
-    model = ConfidenceModel.bundled()
-    found = [model.of(pose(200, 0.02), limits) for limits in ((0.01, 0.1), ACCURACY, (0.25, 2.0), RIGHT_PLACE)]
+    found = [pose(200, 0.02).probability(limits) for limits in ((0.01, 0.1), ACCURACY, (0.25, 2.0), RIGHT_PLACE)]
     assert found == sorted(found) and found[0] < 0.5 < found[1]
-    assert model.of(pose(200, 0.02), (1e6, 180.0)) == pytest.approx(found[-1], abs=1e-6)
-    assert model.of(pose(5, 0.02)) == 0
-    few, enough = (model.of(pose(n, 0.001), (1e6, 180.0)) for n in (11, 12))
+    assert pose(200, 0.02).probability((1e6, 180.0)) == pytest.approx(found[-1], abs=1e-6)
+    assert pose(5, 0.02).probability() == 0
+    few, enough = (pose(n, 0.001).probability((1e6, 180.0)) for n in (11, 12))
     assert few <= 0.5 < enough
 
 
 def test_poses_that_exclude_each_other_have_probabilities_up_to_one_together():
     strong = pose(300, 0.01)
-    found = probabilities(pose(300, 0.01, (strong, pose(30, 0.1))), RIGHT_PLACE)
+    found = pose(300, 0.01, (strong, pose(30, 0.1))).probabilities(RIGHT_PLACE)
     assert found.shape == (3,) and found.sum() == pytest.approx(1) and found[0] == found[1] > found[2]
-    assert probabilities(JointLocalization("no_pose", (), 0)).tolist() == [0]
+    assert JointLocalization("no_pose", (), 0).probabilities().tolist() == [0]

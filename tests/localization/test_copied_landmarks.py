@@ -11,7 +11,7 @@ from wheretolook.features.matches import has_twins
 from wheretolook.features.matching import DescriptorMatcher
 from wheretolook.geometry.camera import cameras_by_id
 from wheretolook.geometry.poses import pose_error
-from wheretolook.localization.confidence import RIGHT_PLACE, probabilities
+from wheretolook.localization.confidence import RIGHT_PLACE
 from wheretolook.localization.config import LocalizerConfig
 from wheretolook.localization.localizer import Localizer
 from wheretolook.localization.rig import Look, PosePrior, matches_among
@@ -52,7 +52,7 @@ def test_a_query_matches_landmarks_that_have_copies(corridor, moved):
     there = np.column_stack([pose[:, :3], pose[:, 3] - pose[:, :3] @ moved])
     errors = [pose_error(found.rig_from_world, each) for each in (pose, there)]
     assert min(errors)[0] < 0.02 and min(errors)[1] < 0.3
-    certain = probabilities(found, RIGHT_PLACE)[0]
+    certain = found.probabilities(RIGHT_PLACE)[0]
     assert certain > 0.9 if not moved.any() else certain < 0.6  # either place is as likely
 
 

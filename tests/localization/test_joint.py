@@ -10,7 +10,6 @@ from scipy.spatial.transform import Rotation
 from wheretolook.features.matches import Matches
 from wheretolook.geometry.camera import ColmapCamera, PinholeCamera
 from wheretolook.geometry.poses import camera_centers, compose_poses, pose_error, poses_looking_along, transform
-from wheretolook.localization.confidence import probabilities
 from wheretolook.localization.config import LocalizerConfig
 from wheretolook.localization.estimation import (
     PoseAmbiguity,
@@ -182,7 +181,7 @@ def test_rotations_of_the_wrong_sign_are_reported_and_the_pose_is_uncertain():
     ]
     found = JointLocalizer(PoseEstimator(points), 0.2, check_turns=True).localize(mirrored)
     assert found.turn_error_deg > 90
-    assert probabilities(found)[0] < 0.9
+    assert found.probabilities()[0] < 0.9
 
 
 def test_views_of_a_small_part_of_the_image_do_not_contradict_rotations():
@@ -365,4 +364,4 @@ def test_an_assumed_focal_length_that_a_wall_does_not_determine_makes_the_pose_u
         found = localizer.localize([assumed])
         error_m = pose_error(found.rig_from_world, poses[0])[0]
         assert error_m < 3 * found.deviation[0]
-        assert probabilities(found)[0] < 0.5
+        assert found.probabilities()[0] < 0.5

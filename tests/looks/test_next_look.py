@@ -8,7 +8,7 @@ from selection.room import POINTS, WEIGHTS, write_room
 from wheretolook import LocalizationMap, load_scorer
 from wheretolook.geometry.lattices import direction_lattice
 from wheretolook.geometry.poses import poses_looking_along, rotation_angle_deg, rotation_looking_along
-from wheretolook.localization.confidence import RIGHT_PLACE, probabilities
+from wheretolook.localization.confidence import RIGHT_PLACE
 from wheretolook.localization.rig import Look
 from wheretolook.localization.rig_localization import JointLocalization
 from wheretolook.looks.next_look import MIN_ANGLE_DEG, N_DIRECTIONS, NextLookSelector, mean_scores_by_pitch
@@ -43,7 +43,7 @@ def localization(scorer, pose, n_inliers=2000, rivals=()):
 
 def test_of_a_known_pose_the_view_with_the_best_score_is_next(scorer, selector):
     certain = localization(scorer, FIRST)
-    assert probabilities(certain, RIGHT_PLACE)[0] > 0.999
+    assert certain.probabilities(RIGHT_PLACE)[0] > 0.999
     chosen = selector.select(certain, pitch_deg=(-90, 90))
     axis = chosen.cam_from_rig[2] @ FIRST[:, :3]
     level = np.array([FIRST[2, 0], FIRST[2, 1], 0]) / np.hypot(*FIRST[2, :2])
@@ -65,7 +65,7 @@ def test_the_gain_is_a_sum_over_hypotheses(scorer, selector):
     other = poses_looking_along(np.asarray(POINTS[1:2], dtype=np.float64), [(-0.3, 1.0, 0.0)])[0]
     weak = localization(scorer, other, 12)
     both = localization(scorer, FIRST, 14, (weak,))
-    found = probabilities(both, RIGHT_PLACE)
+    found = both.probabilities(RIGHT_PLACE)
     assert 0.02 < found[1] < found[0] < 0.98
     axes = direction_lattice(20)
     scores = [

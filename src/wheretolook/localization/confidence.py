@@ -14,18 +14,15 @@ import math
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from wheretolook.dataset.config import ACCURACY, Accuracy
+from wheretolook.dataset.config import Accuracy
 from wheretolook.geometry.poses import Float
 from wheretolook.utils.errors import WeightsError
 from wheretolook.utils.files import read_json_object
-
-if TYPE_CHECKING:
-    from wheretolook.localization.rig_localization import JointLocalization
 
 
 @dataclass(frozen=True)
@@ -132,26 +129,21 @@ class ConfidenceModel(LogisticRegression):
         errors = read_json_object(path)["errors"]
         return cls(place.weights, place.bias, tuple(ErrorModel(**errors[name]) for name in ("position", "orientation")))
 
-    def of(self, localization: JointLocalization, accuracy: Accuracy = ACCURACY) -> float:
-        """Probability that a joint pose is within an accuracy, 0 if there is no pose."""
-        if localization.n_inliers < MIN_INLIERS:
+    def p_within(
+        self,
+        n_inliers: int,
+        n_matches: int,
+        rival_support: float,
+        unique_support: tuple[int, int],
+        deviation: tuple[float, float],
+        accuracy: Accuracy,
+    ) -> float:
+        """Probability that a pose is within an accuracy, given attributes of its `JointLocalization`."""
+        if n_inliers < MIN_INLIERS:
             return 0.0
-        features = confidence_features(
-            localization.n_inliers,
-            localization.n_matches,
-            localization.rival_support,
-            *localization.unique_support,
-            localization.deviation[1],
-        )
-        limits = zip(self.errors, accuracy, localization.deviation, strict=True)
+        features = confidence_features(n_inliers, n_matches, rival_support, *unique_support, deviation[1])
+        limits = zip(self.errors, accuracy, deviation, strict=True)
         place = float(self.predict_proba(features))
         probability = place * min(model.p_below(limit, own) for model, limit, own in limits)
         # random matches of features that hardly match reach eleven inliers, with which poses were not fitted
-        return probability if localization.n_inliers >= 12 else min(probability, 0.5)
-
-
-def probabilities(localization: JointLocalization, accuracy: Accuracy = ACCURACY) -> Float:
-    """Probabilities (1 + rivals,) that the pose and each of its rivals are within an accuracy, in sum at most 1."""
-    model = ConfidenceModel.bundled()
-    found = np.array([model.of(pose, accuracy) for pose in (localization, *localization.rivals)])
-    return found / max(1.0, float(found.sum()))
+        return probability if n_inliers >= 12 else min(probability, 0.5)

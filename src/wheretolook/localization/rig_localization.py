@@ -14,9 +14,10 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from wheretolook.dataset.config import CONTRADICTED, LOCALIZED, NO_POSE, TOO_FEW_MATCHES
+from wheretolook.dataset.config import ACCURACY, CONTRADICTED, LOCALIZED, NO_POSE, TOO_FEW_MATCHES, Accuracy
 from wheretolook.geometry.poses import Float
 from wheretolook.geometry.similarity import poses_from
+from wheretolook.localization.confidence import ConfidenceModel
 from wheretolook.localization.estimation import (
     MIN_MATCHES,
     RIVAL_TRIALS,
@@ -85,6 +86,17 @@ class JointLocalization:
         """One standard deviation of the position (m) and of the orientation (degrees)."""
         variance = np.diagonal(self.covariance)
         return float(np.sqrt(variance[:3].sum())), float(np.degrees(np.sqrt(variance[3:].sum())))
+
+    def probability(self, accuracy: Accuracy = ACCURACY) -> float:
+        """Probability that the pose is within an accuracy, 0 if there is no pose."""
+        return ConfidenceModel.bundled().p_within(
+            self.n_inliers, self.n_matches, self.rival_support, self.unique_support, self.deviation, accuracy
+        )
+
+    def probabilities(self, accuracy: Accuracy = ACCURACY) -> Float:
+        """Probabilities (1 + rivals,) that the pose and each of its rivals are within an accuracy, in sum at most 1."""
+        found = np.array([pose.probability(accuracy) for pose in (self, *self.rivals)])
+        return found / max(1.0, float(found.sum()))
 
 
 class JointLocalizer:

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from wheretolook.geometry.lattices import direction_lattice
 from wheretolook.geometry.poses import Float, camera_centers, pan_tilt_angles, rotation_looking_along, within
-from wheretolook.localization.confidence import RIGHT_PLACE, probabilities
+from wheretolook.localization.confidence import RIGHT_PLACE
 from wheretolook.utils.errors import PlanningError
 
 if TYPE_CHECKING:
@@ -94,7 +94,7 @@ class NextLookSelector:
     def scores_under(self, localization: JointLocalization, axes: Float) -> tuple[Float, Float]:
         """Probabilities (H,), at least 0.02, of the best 6 hypotheses at most, and under each the scores (H, D) of axes (D, 3) in the rig."""
         poses = (localization, *localization.rivals)
-        found = probabilities(localization, RIGHT_PLACE)
+        found = localization.probabilities(RIGHT_PLACE)
         best = np.argsort(-found, kind="stable")[:6]
         best = best[found[best] >= 0.02]
         scores = np.zeros((len(best), len(axes)))
@@ -156,7 +156,7 @@ def _level_from_rig(localization: JointLocalization, up: ArrayLike | None) -> Fl
     """Rotation (3, 3) from the rig to axes with z up, and x in the vertical plane of the first view."""
     first = localization.looks[0].cam_from_rig
     if up is None:
-        found = probabilities(localization, RIGHT_PLACE)
+        found = localization.probabilities(RIGHT_PLACE)
         up = -(1 - found.sum()) * first[1, :3]
         for probability, pose in zip(found, (localization, *localization.rivals), strict=True):
             if pose.rig_from_world is not None:

@@ -38,7 +38,6 @@ from wheretolook.geometry.poses import (
     rotation_angle_deg,
 )
 from wheretolook.geometry.similarity import Similarity
-from wheretolook.localization.confidence import probabilities
 from wheretolook.localization.config import LocalizerConfig
 from wheretolook.localization.estimation import PoseEstimator, SingleViewPoses
 from wheretolook.localization.rig import IDENTITY, Look, PosePrior, checked_turns, matches_among
@@ -211,7 +210,7 @@ class RobotLocalizer:
         looks = [replace(view.look, cam_from_rig=pose) for view, pose in zip(views, poses, strict=True)]
         count = POSES_OF_A_VIEW if len(views) > 1 else POSES_OF_AN_IMAGE
         joint = self._localizer.localize(looks, [view.poses[:count] + view.near_prior for view in views])
-        found = zip((joint, *joint.rivals), probabilities(joint, limits), strict=True)
+        found = zip((joint, *joint.rivals), joint.probabilities(limits), strict=True)
         to_map = self._world_from_map.inverse.apply_to_poses
         in_map = []
         for pose, probability in found:

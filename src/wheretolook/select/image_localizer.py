@@ -18,7 +18,6 @@ from wheretolook.dataset.config import ACCURACY, CONTRADICTED, LOCALIZED, Accura
 from wheretolook.features.extractor import EXTRACTORS, KINDS, ExtractorConfig, Keypoints, kind_of, runnable_extractors
 from wheretolook.features.matches import Matches
 from wheretolook.geometry.poses import Float
-from wheretolook.localization.confidence import probabilities
 from wheretolook.localization.config import LocalizerConfig
 from wheretolook.localization.localizer import Localizer
 from wheretolook.localization.rig import IDENTITY, Look, PosePrior, checked_turns, matches_among, read_turns
@@ -256,7 +255,7 @@ class ImageLocalizer:
         for n, look in enumerate(of_prior):
             poses[n] += rig.single_view_poses(look.scaled(ratio), 1)
         joint = rig.localize([first for first, *_ in views], poses)
-        return Localized.of(queries, joint, probabilities(joint, limits), self.frame, self.features_from)
+        return Localized.of(queries, joint, joint.probabilities(limits), self.frame, self.features_from)
 
     def _extract(self, query: QueryImage) -> Keypoints:
         """Extract the keypoints of an image, or of it turned upright, at the pixels of the image."""

@@ -21,7 +21,6 @@ from wheretolook.dataset.viewpoint_table import CAMERA_ID, PIXELS, poses
 from wheretolook.evaluation.statistics import ClusterBootstrap
 from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.poses import Float, pose_error
-from wheretolook.localization.confidence import ConfidenceModel
 from wheretolook.localization.config import LocalizerConfig
 from wheretolook.localization.estimation import PoseEstimator, SingleViewPoses
 from wheretolook.localization.rig import Look, rig_of
@@ -287,7 +286,7 @@ def set_label(result: JointLocalization, true: Float) -> tuple[object, ...]:
         result.rival_support,
         *result.unique_support,
         *result.deviation,
-        ConfidenceModel.bundled().of(result),
+        result.probability(),
     )
 
 

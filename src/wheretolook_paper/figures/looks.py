@@ -17,12 +17,12 @@ from wheretolook.dataset.config import THRESHOLDS
 from wheretolook.figures.floor_plan import BLUE, GREY, INK, RC, VERMILION, new_figure
 from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.poses import Float, pose_error
-from wheretolook.localization.confidence import ConfidenceModel
 from wheretolook.localization.localizer import Localizer
 from wheretolook.localization.rig import Look, rig_of
 from wheretolook.localization.rig_localization import JointLocalization, JointLocalizer
 from wheretolook.utils.errors import PoseError
 from wheretolook.view.drawing import frustum_segments
+from wheretolook_paper.evaluation.label_report import length_text
 from wheretolook_paper.evaluation.looks import TOGETHER
 from wheretolook_paper.figures.animation import Pixels, pixels_of
 from wheretolook_paper.figures.dollhouse import Dollhouse, draw_house, draw_segments
@@ -124,10 +124,8 @@ class Estimate:
             return "no pose estimated"
         n_inliers = sum(map(len, self.pixels))
         if self.is_good:
-            return f"{n_inliers} inliers, correct, {100 * self.error_m:.1f} cm off"
-        off = f"{self.error_deg:.1f}°"
-        if self.error_m > MAX_ERROR_M:
-            off = f"{self.error_m:.1f} m" if self.error_m >= 1 else f"{100 * self.error_m:.0f} cm"
+            return f"{n_inliers} inliers, correct, {length_text(self.error_m)} off"
+        off = length_text(self.error_m) if self.error_m > MAX_ERROR_M else f"{self.error_deg:.1f}°"
         return f"{n_inliers} inliers, wrong, {off} off"
 
 
@@ -180,7 +178,7 @@ def _estimate(pose: JointLocalization, views: Sequence[Look], true: Float) -> Es
     if pose.cams_from_world is None:
         return Estimate(None, pixels, 0.0, np.inf, np.inf)
     error_m, error_deg = pose_error(pose.cams_from_world, true)
-    probability = float(ConfidenceModel.bundled().of(pose))
+    probability = pose.probability()
     return Estimate(pose.cams_from_world, pixels, probability, float(error_m.max()), float(error_deg.max()))
 
 

@@ -54,7 +54,6 @@ from wheretolook.figures.floor_plan import save_figure
 from wheretolook.geometry.camera import Camera, camera_of, write_cameras
 from wheretolook.geometry.pose_files import images_text
 from wheretolook.geometry.poses import Float, camera_centers, pose_error
-from wheretolook.localization.confidence import probabilities
 from wheretolook.localization.config import LabelConfig, LocalizerConfig
 from wheretolook.localization.localizer import Localizer
 from wheretolook.localization.rig import Look
@@ -368,7 +367,7 @@ def _localize(localizer: Localizer, query: Keypoints) -> Pose:
     seconds = time.perf_counter() - start
     if joint.status != "localized":
         return Pose(None, dict.fromkeys(ACCURACIES, np.nan), seconds)
-    confidence = {at: float(probabilities(joint, limits)[0]) for at, limits in ACCURACIES.items()}
+    confidence = {at: float(joint.probabilities(limits)[0]) for at, limits in ACCURACIES.items()}
     return Pose(joint.rig_from_world, confidence, seconds)
 
 

@@ -64,7 +64,7 @@ class WhereToLook:
         self.scorer = scorer
         self._build = build
         self._accuracy: Accuracy | None = None
-        self._camera_of: dict[str, int] = {}  # camera_id by the name of an image, if each has its camera
+        self.camera_of: dict[str, int] = {}  # camera_id by the name of an image, if each has its camera
         self._space = space
         self._files = files
         axes = direction_lattice(500) if directions is None else np.asarray(directions, dtype=np.float64)
@@ -148,7 +148,7 @@ class WhereToLook:
 
         look = cls(build(here), axes, scene.space, files, build)
         if of_each and (images := scene.map.images) is not None:
-            look._camera_of = dict(zip(images.image_names, images.image_cameras.tolist(), strict=True))
+            look.camera_of = dict(zip(images.image_names, images.image_cameras.tolist(), strict=True))
         return look
 
     @property
@@ -258,13 +258,13 @@ class WhereToLook:
         waypoints = Waypoints.of(camera_centers(poses), names)
         rows = np.flatnonzero(usable_waypoints(self.localization_map, waypoints, skip))
         in_world = self.frame.world_from_map.apply_to_poses(poses)
-        if not self._camera_of:
+        if not self.camera_of:
             views = with_reasons(self.reasons, reported(self.scorer, waypoints, rows, in_world[rows]))
             return views.in_frame(self.frame)
-        camera_ids = np.array([self._camera_of.get(name, -1) for name in waypoints.ids])
+        camera_ids = np.array([self.camera_of.get(name, -1) for name in waypoints.ids])
         for row in rows[camera_ids[rows] < 0]:
             fix = "Name poses like images of the map, or give one camera: --camera-id or --camera, in Python camera."
-            problem = f"the map has {len({*self._camera_of.values()})} cameras, and a pose is of none of its images"
+            problem = f"the map has {len({*self.camera_of.values()})} cameras, and a pose is of none of its images"
             raise MapError(problem, path=waypoints.path, value=waypoints.ids[row], fix=fix)
         parts = []
         for number in np.unique(camera_ids[rows]).tolist():

@@ -122,6 +122,9 @@ def _read_images(path: Path, names: Sequence[str]) -> Iterator[_Features]:
     with (_open_hdf5 if path.suffix.lower() in HDF5_SUFFIXES else _open_database)(path) as read:
         for name in names:
             image = read(name)
+            shapes = [np.shape(values) for values in (image.keypoints, image.descriptors) if values is not None]
+            if shapes[0][1] != 2 or shapes[-1][0] != shapes[0][0]:
+                raise MapError(f"keypoints and descriptors of {name} do not match", path=path, value=shapes, fix=_FIX)
             if image.kind is not None and kind not in (None, image.kind):
                 problem = f"descriptors of {name} are of another kind than those before it"
                 raise MapError(problem, path=path, value=image.kind.name, fix="Give features of one extractor.")

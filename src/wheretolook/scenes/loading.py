@@ -197,6 +197,8 @@ def _check_readable(tree: dict[str, Any], path: Path) -> None:
         name for name in tree.get("extensionsRequired", []) if not re.match("KHR_(mat|tex|lig|mesh_q)|EXT_tex", name)
     }
     unread |= {"EXT_mesh_gpu_instancing"} & {*tree.get("extensionsUsed", [])}
+    unread |= {"skins" for node in tree.get("nodes", []) if "skin" in node}
+    unread |= {"morph targets" for mesh in tree.get("meshes", []) if any(mesh.get("weights", ()))}
     if any("bufferView" not in position or "sparse" in position for position in positions):
         unread |= {name for primitive in primitives for name in primitive.get("extensions", {})} or {"sparse accessors"}
     if any(primitive.get("mode") == 6 for primitive in primitives):
@@ -308,9 +310,13 @@ def _at_uri(uri: str, path: Path) -> Path | bytes:
 
 
 def _ply_textures(path: Path) -> Iterator[Path | bytes]:
-    """Textures that a PLY file names in comments."""
+    """Textures that a PLY file names in comments. Raises ValueError if it is a text with fewer rows than it states."""
     with path.open("rb") as file:
-        header = file.read(1 << 16).partition(b"end_header")[0]
+        header, _, rest = file.read(1 << 16).partition(b"end_header")
+        lines = header.decode("utf-8", errors="replace").lower().splitlines()
+        stated = sum(int(line.split()[2]) for line in lines if line.startswith("element "))
+        if any(line.startswith("format ascii") for line in lines) and stated > rest.count(b"\n") + sum(1 for _ in file):
+            raise ValueError(f"fewer rows than the {stated:,} of its header")
     for line in header.decode("utf-8", errors="replace").splitlines():
         if line.lower().startswith("comment texturefile "):
             yield _sibling(path, line.strip()[len("comment texturefile ") :].strip())

@@ -224,7 +224,9 @@ def _without_names(path: Path, rows: list[tuple[int, list[str]]], of_cameras: bo
     n = len(rows[0][1])
     if n == 4 and all(_is_number(cells[0]) for _, cells in rows):
         first = NamedRows(path, ("id", *"xyz"), rows).numbers(["id"])[:, 0]
-        if (np.diff(first) <= 0).any() and ((first % 1).any() or len({*first}) < len(first)):  # neither times nor numbers
+        if (np.diff(first) <= 0).any() and (
+            (first % 1).any() or len({*first}) < len(first)
+        ):  # neither times nor numbers
             fix = "Start the file with '# x y z yaw_deg' or '# id x y z'."
             problem = "four columns of numbers do not show whether they are id x y z, or x y z and a yaw"
             raise TableError(problem, path=path, value=" ".join(rows[0][1])[:80], fix=fix)

@@ -122,9 +122,6 @@ def _read_images(path: Path, names: Sequence[str]) -> Iterator[_Features]:
     with (_open_hdf5 if path.suffix.lower() in HDF5_SUFFIXES else _open_database)(path) as read:
         for name in names:
             image = read(name)
-            shapes = [np.shape(values) for values in (image.keypoints, image.descriptors) if values is not None]
-            if shapes[0][1] != 2 or shapes[-1][0] != shapes[0][0]:
-                raise MapError(f"keypoints and descriptors of {name} do not match", path=path, value=shapes, fix=_FIX)
             if image.kind is not None and kind not in (None, image.kind):
                 problem = f"descriptors of {name} are of another kind than those before it"
                 raise MapError(problem, path=path, value=image.kind.name, fix="Give features of one extractor.")
@@ -259,6 +256,8 @@ def _open_hdf5(path: Path) -> Iterator[Callable[[str], _Features]]:
                 # hloc counts pixels from the centre of the top-left one, COLMAP from its corner
                 keypoints = _array(_member(image, "keypoints"), name).astype(np.float64)[:, :2] + 0.5
                 descriptors = _array(_member(image, "descriptors"), name).T
+                if keypoints.shape != (len(descriptors), 2):
+                    raise ValueError(f"keypoints and descriptors of {name} do not match")
                 kind: DescriptorKind | None = SIFT
                 may_be_sift = descriptors.shape[1] == SIFT.dimension and named in (None, SIFT)
                 if not may_be_sift or (len(descriptors) and descriptors.min() < 0):

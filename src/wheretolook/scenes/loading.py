@@ -161,9 +161,8 @@ def _glb_textures(path: Path) -> Iterator[Path | bytes]:
     shown = [meshes[node["mesh"]] for node in tree.get("nodes", []) if "mesh" in node]
     if sum(map(len, meshes + shown)) > 40_000:  # trimesh takes 0.3 ms for each
         raise ValueError("its meshes and nodes have more than 40,000 parts; join them")
-    n_corners = 0
-    for part in itertools.chain(*shown):
-        n_corners += accessors[part.get("indices", part["attributes"]["POSITION"])]["count"]
+    drawn = [part.get("indices", part["attributes"]["POSITION"]) for part in itertools.chain(*shown)]
+    n_corners = sum(accessors[at]["count"] for at in drawn)
     if n_corners > fitting(200):  # bytes of a corner while it is read
         raise ValueError(f"its nodes have {n_corners // 3:,} triangles together")
     buffers = _buffers(tree, content, path)
@@ -225,12 +224,12 @@ def _with_all_applied(path: Path) -> str | io.BytesIO:
     for primitive in primitives:
         material = tree["materials"][primitive["material"]] if "material" in primitive else {}
         texture = material.get("pbrMetallicRoughness", {}).get("baseColorTexture", {})
-        transform = texture.get("extensions", {}).get("KHR_texture_transform")
-        if transform:
-            chosen = transform.get("texCoord", texture.get("texCoord", 0))
-            changed.append(({**accessors[primitive["attributes"][f"TEXCOORD_{chosen}"]]}, transform))
+        if transform := texture.get("extensions", {}).get("KHR_texture_transform"):
+            chosen = {**texture, **transform}.get("texCoord", 0)
+            accessor = {**accessors[primitive["attributes"][f"TEXCOORD_{chosen}"]]}
             primitive["attributes"]["TEXCOORD_0"] = len(accessors)
-            accessors.append(changed[-1][0])
+            accessors.append(accessor)
+            changed.append((accessor, transform))
     if not changed:
         return str(path)
     buffers = _buffers(tree, content, path)
@@ -312,12 +311,12 @@ def _at_uri(uri: str, path: Path) -> Path | bytes:
 def _ply_textures(path: Path) -> Iterator[Path | bytes]:
     """Textures that a PLY file names in comments. Raises ValueError if it is a text with fewer rows than it states."""
     with path.open("rb") as file:
-        header, _, rest = file.read(1 << 16).partition(b"end_header")
-        lines = header.decode("utf-8", errors="replace").lower().splitlines()
-        stated = sum(int(line.split()[2]) for line in lines if line.startswith("element "))
-        if any(line.startswith("format ascii") for line in lines) and stated > rest.count(b"\n") + sum(1 for _ in file):
+        start, _, rest = file.read(1 << 16).partition(b"end_header")
+        header = start.decode("utf-8", errors="replace")
+        stated = sum(map(int, re.findall(r"^element \S+ (\d+)", header, re.M)))
+        if "format ascii" in header and rest.count(b"\n") + sum(1 for _ in file) < stated:
             raise ValueError(f"fewer rows than the {stated:,} of its header")
-    for line in header.decode("utf-8", errors="replace").splitlines():
+    for line in header.splitlines():
         if line.lower().startswith("comment texturefile "):
             yield _sibling(path, line.strip()[len("comment texturefile ") :].strip())
 

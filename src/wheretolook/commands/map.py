@@ -180,7 +180,7 @@ def _map_mesh(options: BuildMap, files: SceneFolder, log: Log) -> None:
     made_from = existing(files.mesh, SceneError, "scenes")
     floor = files.mapped_floor()
     camera = _mapping_camera(config, scene.camera, seed)
-    views = [asdict(scene.config.free_space), camera.record(), seed, made_from, *([floor] if floor else [])]
+    views = [asdict(scene.free_space), camera.record(), seed, made_from, *([floor] if floor else [])]
     cache = files.stage_cache("map", cache_key("map", [config.record(), *views]))
     model = [files.map / name for name in ("cameras.bin", "images.bin", "points3D.bin")]
     if cache.is_current(files.landmarks, *model):

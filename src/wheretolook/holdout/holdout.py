@@ -33,9 +33,8 @@ from wheretolook.utils.files import ArtifactCache, cache_key
 from wheretolook.utils.processes import WorkerPool
 
 KEPT = tuple(LocalizerConfig().min_inliers * share for share in (16, 8, 4, 2))
-"""Landmarks that the rest may still have of what a photograph observes, at the quantile `COVERED_WORSE` of each grown
-block: from plenty for a pose to hardly enough, since not all are matched again."""
-COVERED_WORSE = 0.25
+"""Landmarks that the rest may still have of what a photograph observes, at the lower quartile of each grown block: from
+plenty for a pose to hardly enough, since not all are matched again."""
 MIN_REST = 0.1  # share of the photographs that is never held out
 MIN_LANDMARKS = 50  # of a map without a block
 VIEWS = 60  # maximum number of photographs of a block that are localized; then evenly spread ones
@@ -172,7 +171,7 @@ def _block_size(observes: csr_array, order: NDArray[np.int64], kept: float) -> i
     high = max(2, int((1 - MIN_REST) * len(order)))
     while low < high:  # the larger the block, the less is left
         middle = (low + high) // 2
-        if np.quantile(landmarks_kept(observes, order[:middle]), COVERED_WORSE) <= kept:
+        if np.quantile(landmarks_kept(observes, order[:middle]), 0.25) <= kept:
             high = middle
         else:
             low = middle + 1

@@ -141,7 +141,8 @@ class ConfidenceModel(LogisticRegression):
         """Probability that a pose is within an accuracy, given attributes of its `JointLocalization`."""
         if n_inliers < MIN_INLIERS:
             return 0.0
-        features = confidence_features(n_inliers, n_matches, rival_support, *unique_support, deviation[1])
+        unique, rival_unique = unique_support
+        features = confidence_features(n_inliers, n_matches, rival_support, unique, rival_unique, deviation[1])
         limits = zip(self.errors, accuracy, deviation, strict=True)
         place = float(self.predict_proba(features))
         probability = place * min(model.p_below(limit, own) for model, limit, own in limits)

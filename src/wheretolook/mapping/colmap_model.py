@@ -37,7 +37,6 @@ if TYPE_CHECKING:
 REBUILD = "Copy or build the model again."
 # A point without its track. The track's elements follow: image id and index of the keypoint, uint32 each.
 POINT = np.dtype([("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("n", "<u8")])
-_UINT32 = Struct("<I")
 _UINT64 = Struct("<Q")
 _MAX_COORDINATE = 1e12  # of a point or a camera; its square is still finite in single precision
 
@@ -215,7 +214,7 @@ def _point_length(data: memoryview, start: int) -> int:
 
 
 def _frame_length(data: memoryview, start: int) -> int:
-    return 68 + 16 * int(_UINT32.unpack_from(data, start + 64)[0])
+    return 68 + 16 * int(Struct("<I").unpack_from(data, start + 64)[0])
 
 
 LANDMARKS_FILE = "landmarks.npz"  # in the folder of a map of this project

@@ -22,9 +22,6 @@ from wheretolook.utils.errors import ConfigError, MapError, TableError
 from wheretolook.utils.files import read_json_object
 from wheretolook.utils.texts import LOG
 
-# A marker is rejected if the root mean square reprojection error of its corners exceeds both this many pixels and this
-# share of the photographs' longer side. That of a marker that was moved, or printed twice, is tens of pixels.
-
 
 @dataclass(frozen=True, eq=False)
 class MarkerView:
@@ -103,6 +100,7 @@ def place_marker(marker_id: int, views: Sequence[MarkerView]) -> Marker:
 
     found = least_squares(residuals, start.ravel(), loss="soft_l1", f_scale=1.0, x_scale="jac")
     error_px = float(np.sqrt(2 * np.mean(residuals(found.x) ** 2)))
+    # that of a marker that was moved, or printed twice, is tens of pixels
     limit_px = max(4.0, 1 / 400 * max(max(view.camera.width, view.camera.height) for view in views))
     if not error_px <= limit_px:
         problem = (
@@ -209,7 +207,6 @@ def _edge_line(grey: NDArray[np.uint8], start: Float, end: Float, inside: Float)
 REPORT_FILE = "report.json"
 DEPTH_M = 5.0
 """Median depth of the images that a map of unknown scale is scaled to: scorers were trained in rooms."""
-MAX_WRONG_SHARE = 0.05  # of given positions that are left out
 
 
 @dataclass(frozen=True)
@@ -392,7 +389,7 @@ def scale_from_positions(centers: Mapping[str, Float], positions: Mapping[str, F
     """The scale, and the similarity from camera centres in the map to known positions in metres, by photograph.
 
     The tolerance is a share of the diagonal of the box around the positions used. The worst positions beyond it are left
-    out, up to `MAX_WRONG_SHARE`, with a warning. Raises MapError if fewer than three photographs are in the map, all are
+    out, up to 5 %, with a warning. Raises MapError if fewer than three photographs are in the map, all are
     on a line, or the error of another exceeds the tolerance.
     """
     names = [name for name in positions if name in centers]
@@ -400,7 +397,7 @@ def scale_from_positions(centers: Mapping[str, Float], positions: Mapping[str, F
     if not names and positions and centers:
         value = f"{next(iter(positions))}; images are named like {next(iter(centers))}"
         raise MapError("no position is that of an image in the map", value=value, fix="Name the images as in the map.")
-    for removable in range(int(MAX_WRONG_SHARE * len(names)), -1, -1):
+    for removable in range(int(0.05 * len(names)), -1, -1):
         source = np.array([centers[name] for name in names]).reshape(-1, 3)
         target = np.array([positions[name] for name in names]).reshape(-1, 3)
         similarity = fit_similarity(source, target)

@@ -164,7 +164,7 @@ def _glb_textures(path: Path) -> Iterator[Path | bytes]:
     if sum(map(len, meshes + shown)) > 40_000:  # trimesh takes 0.3 ms for each
         raise ValueError("its meshes and nodes have more than 40,000 parts; join them")
     n_corners = 0
-    for part in itertools.chain(*shown):
+    for part in itertools.chain.from_iterable(shown):
         n_corners += accessors[part.get("indices", part["attributes"]["POSITION"])]["count"]
     if n_corners > fitting(200):  # bytes of a corner while it is read
         raise ValueError(f"its nodes have {n_corners // 3:,} triangles together")

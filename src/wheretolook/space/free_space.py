@@ -133,11 +133,11 @@ class TsdfSpace(FreeSpace):
         progress: bool = True,
     ) -> None:
         super().__init__(volume.surface(), replace(config, two_sided=False), device)
-        self._step_m = volume.config.voxel_size_m
+        self._step_m = volume.voxel_size_m
         cell_m = max(self._step_m, min(0.05, self.config.clearance_m / 2))
         nx, ny, nz = np.maximum(np.ceil((self.bounds[1] - self.bounds[0]) / cell_m), 1).astype(int).tolist()
         self.cells = VoxelGrid.over(self.bounds, (nx, ny, nz))
-        seen = seen_through(self.cells.centers(), images, volume.config.max_depth_m, progress)
+        seen = seen_through(self.cells.centers(), images, volume.max_depth_m, progress)
         padded = np.pad(seen.reshape(nx, ny, nz), 1)  # space beyond the bounds counts as unseen
         to_unseen_m = distance_transform_edt(padded, sampling=self.cells.voxel_m)[1:-1, 1:-1, 1:-1]
         self.to_unseen_m = to_unseen_m.astype(np.float32)

@@ -320,7 +320,7 @@ class TsdfOcclusion(MeshOcclusion):
 
     def __init__(self, volume: TsdfVolume, margin_m: float = 0.05, device: str = "cpu") -> None:
         super().__init__(MeshRaycaster(volume.surface(), device), margin_m)
-        self._too_close_m = volume.config.voxel_size_m / 2
+        self._too_close_m = volume.voxel_size_m / 2
 
     @classmethod
     def from_inputs(cls, inputs: OcclusionInputs) -> TsdfOcclusion:

@@ -18,6 +18,9 @@ GROUP = 32  # landmarks; the best groups are selected first, and in them the bes
 MAX_NEAREST = 16  # landmarks that `DescriptorMatcher.nearest` returns at most
 MISSING_PRODUCT = -(2**28)
 MISSING = 2**28  # squared distance
+# Size of a block of products. On a GPU, where each worker holds a block and its intermediate results, blocks of 1 GiB
+# are no faster. On a CPU blocks of 16 MiB, beyond its cache, take a tenth more.
+_PRODUCT_BYTES = {"cpu": 2**23, "cuda": 2**27}
 
 
 class DescriptorMatcher:
@@ -59,11 +62,8 @@ class DescriptorMatcher:
         # OpenMP's limit is per thread: without this, the first product in a new thread would start a thread per core.
         torch.set_num_threads(torch.get_num_threads())
         queries = torch.from_numpy(descriptors).to(self.device)
-        # on a GPU, where each worker holds a block and its intermediate results, blocks of 1 GiB are no faster; on a CPU
-        # blocks of 16 MiB, beyond its cache, take a tenth more
-        n_bytes = {"cpu": 2**23, "cuda": 2**27}[self.device.type]
         # products of few queries are slow: with 4, a product takes 2.5 times as long as with 16
-        block = max(16, n_bytes // (4 * self._descriptors.shape[1]))
+        block = max(16, _PRODUCT_BYTES[self.device.type] // (4 * self._descriptors.shape[1]))
         parts = [self._best(part, count) for part in queries.split(block)]
         rows, best = (torch.cat([part[i] for part in parts]).cpu().long().numpy() for i in (0, 1))
         return rows, best
@@ -119,6 +119,9 @@ def _byte_products_are_fast() -> bool:
     return torch.equal(product.long(), left @ right)
 
 
+_PRODUCTS = {"cpu": 2**22, "cuda": 2**25}  # per block: a CPU keeps them in its cache, on a GPU more are slower
+
+
 class SimilarityMatcher:
     """Matches keypoints of images with descriptors (N, D) float16 of landmarks, on "cpu" or a CUDA device.
 
@@ -161,8 +164,7 @@ class SimilarityMatcher:
         best = torch.full((len(queries), count), -torch.inf, device=self.device)
         near = torch.zeros((len(queries), count), dtype=torch.int64, device=self.device)
         keypoint_of: list[Tensor] = []
-        n_products = {"cpu": 2**22, "cuda": 2**25}[self.device.type]  # a CPU's cache; on a GPU more are slower
-        block = GROUP * max(count, n_products // len(queries) // GROUP)
+        block = GROUP * max(count, _PRODUCTS[self.device.type] // len(queries) // GROUP)
         for start in range(0, self.n_landmarks, block):
             product = self._product(queries, self._descriptors[start : start + block]).view(images, max_count, -1)
             product = product.masked_fill_(missing, -torch.inf)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from numbers import Integral
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,9 +16,6 @@ from numpy.typing import ArrayLike, NDArray
 from wheretolook.geometry.poses import Float
 from wheretolook.utils.errors import ConfigError, MapError, TableError, check_choice
 from wheretolook.utils.files import read_text, write_text
-
-if TYPE_CHECKING:
-    import pycolmap
 
 MAX_SIDE_PX = 10**6  # of an image; COLMAP's limit is not much higher
 MAX_PX = 1e12  # of a focal length or a principal point, so that products stay finite and huge integers are refused
@@ -185,7 +182,7 @@ class ColmapCamera(_Image):
         _check_intrinsics(self.width, self.height, focal_px)
 
     @cached_property
-    def _camera(self) -> pycolmap.Camera:
+    def _camera(self) -> Any:
         import pycolmap
 
         return pycolmap.Camera(model=self.model, width=self.width, height=self.height, params=list(self.params))
@@ -295,8 +292,8 @@ def turn_camera(camera: Camera, quarters: int) -> Camera:
     return camera
 
 
-def mean_focal_px(camera: pycolmap.Camera) -> float:
-    """Mean focal length in pixels; of a panorama, pixels per radian across."""
+def mean_focal_px(camera: Any) -> float:
+    """Mean focal length of a `pycolmap.Camera` in pixels; of a panorama, pixels per radian across."""
     if len(camera.focal_length_idxs()) == 0:
         return float(camera.width / (2 * np.pi))
     return float(camera.mean_focal_length())

@@ -24,6 +24,7 @@ from numpy.typing import ArrayLike
 
 from wheretolook.geometry.poses import (
     Float,
+    are_rotations,
     camera_centers,
     invert_poses,
     quaternion_from_rotation,
@@ -254,8 +255,7 @@ def _matrix_rows(path: Path, rows: list[tuple[int, list[str]]]) -> NamedRows:
     values = NamedRows(path, ("t",) * named + columns, rows).numbers(columns)
     poses = values[:, :12].reshape(-1, 3, 4)
     rotations = poses[:, :, :3]
-    off = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
-    rigid = (off < 0.01) & (np.linalg.det(rotations) > 0) & (values[:, 12:] == (0, 0, 0, 1)[: n - named - 12]).all(1)
+    rigid = are_rotations(rotations, 0.01) & (values[:, 12:] == (0, 0, 0, 1)[: n - named - 12]).all(1)
     for row in np.flatnonzero(~rigid).tolist():
         value = f"line {rows[row][0]}: {' '.join(rows[row][1])[:80]}"
         raise TableError("a matrix is no rotation and translation", path=path, value=value, fix=f"Give {FORMATS}.")

@@ -15,7 +15,7 @@ from tqdm.auto import tqdm
 
 from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.mesh import TexturedMesh
-from wheretolook.geometry.poses import Float, camera_centers, check_poses
+from wheretolook.geometry.poses import Float, are_rotations, camera_centers, check_poses
 from wheretolook.geometry.similarity import local_origin, poses_from
 from wheretolook.utils.devices import fitting
 from wheretolook.utils.errors import ConfigError, SceneError, check_positive
@@ -49,7 +49,7 @@ class DepthImage:
             fix = "Divide a 16-bit image by its depth scale, mostly 1000 a metre."
             raise ConfigError("a depth image must hold floats, in metres", value=str(dtype), fix=fix)
         rotation = check_poses([self.cam_from_world])[0, :, :3]
-        if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) or np.linalg.det(rotation) < 0:
+        if not are_rotations(rotation, 1e-3):
             raise ConfigError("cam_from_world of a depth image must hold a rotation", value=rotation.tolist())
 
     def readings(self, max_depth_m: float, stride: int = 1) -> NDArray[np.float32]:

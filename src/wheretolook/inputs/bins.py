@@ -118,6 +118,9 @@ def count_bins_kernel(
     wp.atomic_add(n_filled, view, filled)
 
 
+BLOCK_BYTES = 1 << 30  # of bins that are computed at a time
+
+
 @dataclass(frozen=True, eq=False)
 class BinnedViews:
     """Landmarks of a batch of views, binned."""
@@ -152,7 +155,7 @@ def bin_views(
     """Bin the visible landmarks of each of B views in bins x bins cells, with all of `CHANNELS`.
 
     With the points' `landmarks`, the bins also have `LANDMARK_CHANNELS`, for about three times the memory. About
-    Bins of 1 GiB are computed at a time, a view by one thread, so that sums do not depend on the order of
+    `BLOCK_BYTES` of views are computed at a time, a view by one thread, so that sums do not depend on the order of
     threads; views of COLMAP cameras are computed on the CPU.
     """
     if isinstance(posed.camera, ColmapCamera):
@@ -204,7 +207,7 @@ def _blocks(posed: PosedViews, bins: int, device: str, n_values: int) -> Iterato
     assert isinstance(camera, PinholeCamera)
     landmarks = frustum.points_on_device(posed.points, device)
     sets = frustum.sets_on_device(posed.unoccluded, device)
-    block = max(1, (1 << 30) // (bins * bins * n_values * 4))
+    block = max(1, BLOCK_BYTES // (bins * bins * n_values * 4))
     for begin in range(0, len(poses), block):
         rows = slice(begin, min(begin + block, len(poses)))
         grid: Any = BinGrid()

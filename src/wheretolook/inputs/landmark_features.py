@@ -24,6 +24,11 @@ from wheretolook.mapping.landmarks import MAP_ATTRIBUTES
 from wheretolook.visibility.frustum import LandmarkSets
 from wheretolook.visibility.occlusion import NoOcclusion
 
+BLOCK_ENTRIES = {
+    "cpu": 1 << 15,
+    "cuda": 1 << 22,
+}  # visible landmarks in a block: fits the cache, or takes 1 GB of a GPU
+
 
 @dataclass(frozen=True, eq=False)
 class ViewLandmarks:
@@ -115,8 +120,7 @@ class LandmarkDescriber:
         n_visible = np.diff(starts)
         if limit is not None and len(n_visible) and n_visible.max() > limit:
             starts, indices = _thinned(torch.from_numpy(starts), indices, limit)
-        at_once = {"cpu": 1 << 15, "cuda": 1 << 22}  # visible landmarks: fits the cache, or takes 1 GB of a GPU
-        for rows in ragged_blocks(starts, at_once[self._points.device.type]):
+        for rows in ragged_blocks(starts, BLOCK_ENTRIES[self._points.device.type]):
             part = starts[rows.start : rows.stop + 1]
             entries = indices[int(part[0]) : int(part[-1])]
             described = self._describe(cam_from_world[rows], torch.from_numpy(part - part[0]), entries)

@@ -42,10 +42,13 @@ FORMATS = (
     "COLMAP's images.txt, images.bin or folder, or JSON as select writes it; lines that start with # are comments"
 )
 NAME_COLUMNS = ("image", "id", "waypoint", "name", "t", "timestamp")
-_TUM_ORDER = (*TRANSLATION_COLUMNS, "qx", "qy", "qz", "qw")
 _IMAGE_COLUMNS = ("image_id", *POSE_COLUMNS, "camera_id", "name")
-_SYNONYMS = {"label": "image", "filename": "image", "file_name": "image", "image_name": "image"}
-_SYNONYMS |= {"x/easting": "x", "y/northing": "y", "z/altitude": "z", "easting": "x", "northing": "y", "altitude": "z"}
+_SYNONYMS = {
+    **dict.fromkeys(("label", "filename", "file_name", "image_name"), "image"),
+    **dict.fromkeys(("x/easting", "easting"), "x"),
+    **dict.fromkeys(("y/northing", "northing"), "y"),
+    **dict.fromkeys(("z/altitude", "altitude"), "z"),
+}
 MAX_ROWS = 500_000  # of a table
 CAM_FROM_BASE = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])  # a camera that looks along x of a body whose z is up
 
@@ -349,9 +352,10 @@ def holds_cam_from_world(table: NamedRows) -> bool:
     if not {*POSE_COLUMNS} <= {*table.columns}:
         return False
     order = tuple(sorted(POSE_COLUMNS, key=lambda name: table.columns[name]))
-    if order not in (POSE_COLUMNS, _TUM_ORDER):
+    tum = (*TRANSLATION_COLUMNS, "qx", "qy", "qz", "qw")
+    if order not in (POSE_COLUMNS, tum):
         problem = "the order of the columns does not show whether poses are camera-to-world or world-to-camera"
-        fix = f"Order them as TUM, {','.join(_TUM_ORDER)}, camera-to-world, or COLMAP, {','.join(POSE_COLUMNS)}, world-to-camera."
+        fix = f"Order them as TUM, {','.join(tum)}, camera-to-world, or COLMAP, {','.join(POSE_COLUMNS)}, world-to-camera."
         raise TableError(problem, path=table.path, value=",".join(order), fix=fix)
     return order == POSE_COLUMNS
 

@@ -26,6 +26,7 @@ from wheretolook.holdout.photo_map import MAX_ERROR_DEG, MAX_ERROR_M, Photograph
 from wheretolook.localization.config import LocalizerConfig, versions
 from wheretolook.localization.localizer import Localizer, localization_errors
 from wheretolook.mapping.colmap_model import observation_matrix, read_model, write_model
+from wheretolook.mapping.config import MIN_TRIANGULATION_ANGLE_DEG
 from wheretolook.mapping.feature_files import read_features
 from wheretolook.mapping.landmarks import Landmarks, load_colmap_landmarks
 from wheretolook.utils.errors import MapError, MapWarning
@@ -193,9 +194,6 @@ def _landmarks_without(observes: csr_array, group: NDArray[np.int64]) -> int:
     return int(_remaining(observes, group).sum())
 
 
-MIN_ANGLE_DEG = 1.5  # COLMAP's own minimum angle between the rays of a landmark
-
-
 @dataclass(frozen=True, eq=False)
 class HoldoutResult:
     """A block that was held out, the landmarks (without descriptors) of the remaining map, and its localized views.
@@ -235,7 +233,13 @@ def hold_out_blocks(
     `MapWarning`. Raises MapError if fewer than two remain.
     """
     blocks = choose_blocks(source) if blocks is None else blocks
-    limits = [source.limit_m.tolist(), MAX_ERROR_DEG, MIN_ANGLE_DEG, asdict(LocalizerConfig()), source.fov_deg]
+    limits = [
+        source.limit_m.tolist(),
+        MAX_ERROR_DEG,
+        MIN_TRIANGULATION_ANGLE_DEG,
+        asdict(LocalizerConfig()),
+        source.fov_deg,
+    ]
     key = cache_key(4, versions(), source.key, limits)  # version of what is cached of a block
     folder = work / f"blocks-{key}"
     for old in work.glob("blocks-*"):
@@ -281,7 +285,7 @@ def without(model: Any, image_ids: Sequence[int]) -> Any:
     """Return a copy of a `pycolmap.Reconstruction` without some images and their influence on its landmarks.
 
     The frames of these images are removed with all their images. A landmark that loses an observation is triangulated
-    again from the others; it is dropped if it has fewer than two, if its rays meet at less than `MIN_ANGLE_DEG`, or if
+    again from the others; it is dropped if it has fewer than two, if its rays meet at less than `MIN_TRIANGULATION_ANGLE_DEG`, or if
     it reprojects worse than any landmark of the whole map.
     """
     rest = pycolmap.Reconstruction(model)
@@ -300,7 +304,8 @@ def without(model: Any, image_ids: Sequence[int]) -> Any:
     options.ceres.solver_options.num_threads = 1
     pycolmap.create_default_bundle_adjuster(options, adjusting, rest).solve()
     rest.update_point_3d_errors()
-    pycolmap.ObservationManager(rest).filter_points3D_with_small_triangulation_angle(MIN_ANGLE_DEG, set(changed))
+    observations = pycolmap.ObservationManager(rest)
+    observations.filter_points3D_with_small_triangulation_angle(MIN_TRIANGULATION_ANGLE_DEG, set(changed))
     for number in changed:
         if number in rest.points3D:
             point = rest.points3D[number]

@@ -71,7 +71,6 @@ def crop_pixels(camera: Camera, pixels: Float, fov_deg: float, crop: int) -> tup
 MAX_ERROR_M, MAX_ERROR_DEG = THRESHOLDS[0]  # below both, a photograph counts as localized
 CHECKS = "checks"  # folder of the folders of checks, next to the datasets
 WORK = "work"  # folder of cached work, in that of a check
-MIN_PHOTOGRAPHS = 8  # with fewer, blocks are too small
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,7 +191,7 @@ def open_map(
 
     Raises:
         MapError: the model or the features cannot be used or do not belong together, the features are of an unknown
-            kind, or the model has fewer than `MIN_PHOTOGRAPHS` photographs.
+            kind, or the model has fewer than 8 photographs.
     """
     model = read_model(model_dir)
     _check_photographs(model, model_dir)
@@ -238,8 +237,8 @@ def open_map(
 
 def _check_photographs(model: Any, model_dir: Path) -> None:
     n_posed = sum(image.has_pose for image in model.images.values())
-    if n_posed < MIN_PHOTOGRAPHS:
-        problem = f"a check needs at least {MIN_PHOTOGRAPHS} photographs"
+    if n_posed < 8:  # blocks would be too small
+        problem = "a check needs at least 8 photographs"
         fix = "Take more photographs, and map them all."
         raise MapError(problem, path=model_dir, value=n_posed, fix=fix)
 

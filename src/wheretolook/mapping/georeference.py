@@ -16,7 +16,13 @@ from wheretolook.geometry.pose_files import NAME_COLUMNS, NamedRows, locations_o
 from wheretolook.geometry.poses import Float, camera_centers
 from wheretolook.geometry.similarity import Similarity
 from wheretolook.mapping.colmap_model import ModelArrays
-from wheretolook.mapping.config import MARKER, SCALE_TOLERANCE_PERCENT, FrameOptions, MarkerConfig
+from wheretolook.mapping.config import (
+    MARKER,
+    MIN_TRIANGULATION_ANGLE_DEG,
+    SCALE_TOLERANCE_PERCENT,
+    FrameOptions,
+    MarkerConfig,
+)
 from wheretolook.mapping.photographs import read_photograph
 from wheretolook.utils.errors import ConfigError, MapError, TableError
 from wheretolook.utils.files import read_json_object
@@ -91,7 +97,7 @@ def place_marker(marker_id: int, views: Sequence[MarkerView]) -> Marker:
     rays = start.mean(0) - centers
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     angle_deg = np.degrees(np.arccos(np.clip((rays @ rays.T).min(), -1, 1)))
-    if not angle_deg >= 1.5:  # as for landmarks
+    if not angle_deg >= MIN_TRIANGULATION_ANGLE_DEG:
         problem = f"marker {marker_id} is in photographs from one direction only, {angle_deg:.1f} degrees apart at most"
         raise MapError(problem, value=" ".join(images), fix="Take another photograph of it from another place.")
 

@@ -101,8 +101,6 @@ def _median_direction(directions: Float) -> Float:
     return at / max(float(np.linalg.norm(at)), 1e-12)
 
 
-MESH_DISTANCE_M = (0.3, 100.0)
-"""Largest plausible median distance of landmarks to a mesh, and the farthest distance that is measured."""
 LOOKING_DOWN = 0.7  # mean of the cameras' axes along -z above which their roll does not determine up
 
 
@@ -129,10 +127,11 @@ def mesh_warning(points: ArrayLike, raycaster: MeshRaycaster) -> str:
     """Message if a mesh seems not to be in a map's frame and unit, because landmarks (N, 3) m are far from it; else ""."""
     at = np.asarray(points, dtype=np.float64)
     at = at[:: max(1, -(-len(at) // 10_000))]  # points are enough for a median
-    off_m = float(np.median(raycaster.distance_to_surface(at, MESH_DISTANCE_M[1])))
-    if not off_m > MESH_DISTANCE_M[0]:
+    farthest_m = 100.0
+    off_m = float(np.median(raycaster.distance_to_surface(at, farthest_m)))
+    if not off_m > 0.3:
         return ""
-    far = f"{off_m:.2f} m or more" if np.isfinite(off_m) else f"more than {MESH_DISTANCE_M[1]:g} m"
+    far = f"{off_m:.2f} m or more" if np.isfinite(off_m) else f"more than {farthest_m:g} m"
     return (
         f"half of the landmarks are {far} from the mesh, so it seems to be in another frame or unit than the model. "
         "Export both in the same frame and unit; --mesh-up y turns a mesh with y up (glTF's own)"

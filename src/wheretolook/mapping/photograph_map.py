@@ -41,7 +41,6 @@ from wheretolook.utils.errors import ConfigError, MapError
 from wheretolook.utils.files import ArtifactCache, cache_key, storing_in_database, temporary_folder
 from wheretolook.utils.texts import quiet_colmap
 
-_MANIFEST = "steps.json"
 _MIN_IMAGES = 3  # of a model: two photographs do not determine a camera
 _MIN_INLIERS = 30  # as COLMAP needs to place a photograph
 
@@ -115,7 +114,7 @@ def match_and_map(
     version = 2  # of the results
     key = cache_key(version, key, intrinsics, cameras.camera_of.tolist(), cameras.given, seed)
     folder = work / "sparse"
-    cache = ArtifactCache(work, key, "sparse", _MANIFEST)
+    cache = ArtifactCache(work, key, "sparse", "steps.json")
     results = cache.load("sparse.json") if cache.is_current(database, folder) else None
     if results is None:
         cache.clear()
@@ -132,7 +131,7 @@ def _cached_arrays(
     work: Path, key: str, step: str, compute: Callable[[], dict[str, NDArray[Any]]]
 ) -> dict[str, NDArray[Any]]:
     """Arrays of a step of work, read from its file or computed and written there."""
-    cache = ArtifactCache(work, key, step, _MANIFEST)
+    cache = ArtifactCache(work, key, step, "steps.json")
     name = f"{step}.npz"
     return (cache.load(name) or cache.store({name: compute()}))[name]
 

@@ -19,14 +19,7 @@ from wheretolook.geometry.camera import Camera, PinholeCamera, cameras_by_id, fi
 from wheretolook.geometry.poses import Float, camera_centers
 from wheretolook.geometry.similarity import Similarity
 from wheretolook.localization.config import versions
-from wheretolook.mapping.colmap_model import (
-    ModelArrays,
-    compact_poses,
-    model_arrays,
-    read_model,
-    registered_names,
-    select_points,
-)
+from wheretolook.mapping.colmap_model import ModelArrays, compact_poses, model_arrays, read_model, registered_names
 from wheretolook.mapping.config import FrameOptions, ImportConfig, place_name
 from wheretolook.mapping.feature_files import DATABASE_FILE, read_descriptors
 from wheretolook.mapping.georeference import DEPTH_M, median_depths
@@ -139,7 +132,7 @@ class PhotographedMap:
             compact_poses(self.poses),
             has_photographs=self.photographs,
             cameras=dict(zip(self.arrays.image_cameras.tolist(), self.cameras, strict=True)),
-            images=select_points(self.arrays, np.isin(self.arrays.point_ids, landmarks.ids)),
+            images=self.arrays.of_points(landmarks.ids),
         )
 
     @property

@@ -226,6 +226,20 @@ class ModelArrays:
     observation_image: NDArray[np.int64]  # (O,) row in `image_ids`
     observation_keypoint: NDArray[np.int64]  # (O,) index of the keypoint in its image
 
+    @property
+    def track_lengths(self) -> NDArray[np.int64]:
+        """Number of observations of each point, (P,)."""
+        return np.diff(self.observation_start)
+
+    @property
+    def observation_point(self) -> NDArray[np.int64]:
+        """Row of the point of each observation, (O,)."""
+        return np.repeat(np.arange(len(self.points)), self.track_lengths)
+
+    def of_points(self, ids: NDArray[np.int64]) -> ModelArrays:
+        """Return the points of some ids, with their observations."""
+        return select_points(self, np.isin(self.point_ids, ids))
+
 
 def model_suffix(model_dir: str | Path) -> str:
     """Suffix of the model's files in a folder: ".bin" or ".txt". Raises MapError if the model is missing or incomplete."""
@@ -419,7 +433,7 @@ def model_arrays(reconstruction: Any) -> ModelArrays:
 
 def select_points(model: ModelArrays, keep: NDArray[np.bool_]) -> ModelArrays:
     """Select the points (P,) of a model for which `keep` is true, with their observations."""
-    lengths = np.diff(model.observation_start)
+    lengths = model.track_lengths
     rows = np.repeat(keep, lengths)
     return replace(
         model,
@@ -437,7 +451,7 @@ def observation_matrix(model: ModelArrays, group: NDArray[np.integer[Any]] | Non
 
     Its product with its own transpose counts the points that two images share.
     """
-    point = np.repeat(np.arange(len(model.points)), np.diff(model.observation_start))
+    point = model.observation_point
     rows = model.observation_image if group is None else group[model.observation_image]
     n_rows = len(model.image_ids) if group is None else int(group.max()) + 1
     from scipy.sparse import coo_array

@@ -379,7 +379,7 @@ def scale_from_depths(arrays: ModelArrays, cam_from_world: Float) -> MapScale:
 
 def median_depths(arrays: ModelArrays, cam_from_world: Float) -> Float:
     """Median depth (I,) of the landmarks that each image observes, from poses (I, 3, 4); NaN where it observes none."""
-    point = np.repeat(arrays.points, np.diff(arrays.observation_start), axis=0)
+    point = arrays.points[arrays.observation_point]
     axis = cam_from_world[arrays.observation_image, 2]
     depth = (axis[:, :3] * point).sum(1) + axis[:, 3]
     ordered = depth[np.lexsort((depth, arrays.observation_image))]

@@ -59,7 +59,7 @@ def test_arguments_override_the_file():
         ("select", ["--map", "m", "--out", "o.csv", "--at", "a.csv", "--pitch", "-30", "30"], "pitch_deg", (-30.0, 30.0)),
         ("select", ["--map", "m", "--out", "o.csv", "--grid", "1", "--camera-id", "3", "--skip"], "skip", True),
         ("benchmark", ["a", "b", "--methods", "best", "set"], "scenes", (Path("a"), Path("b"))),
-        ("adapt", ["--map", "m", "--scale", "2"], "adapt.map", Path("m")),
+        ("adapt", ["--map", "m", "--scale", "2"], "map", Path("m")),
         ("select", ["--map", "m", "--out", "o.csv", "--at", "a.csv", "--scale", "2", "--scale", "2"], "scale", 2),
     ],
 )  # fmt: skip

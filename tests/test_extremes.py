@@ -18,7 +18,7 @@ from wheretolook.geometry.lattices import VoxelGrid, fibonacci_sphere
 from wheretolook.geometry.poses import poses_looking_along, rotation_looking_along
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.map import Map
-from wheretolook.planning.config import ViewpointMapConfig
+from wheretolook.planning.config import MappedLattice
 from wheretolook.planning.scene_map import build_viewpoint_map
 from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.scorers.registry import make_scorer, scorers
@@ -119,7 +119,7 @@ def test_seventy_thousand_directions():
     expected = count_plain(CAMERA, rotations[some], place, landmarks.points, everything)
     np.testing.assert_array_equal(counts[0, some], expected[0])
     with pytest.raises(ConfigError):
-        ViewpointMapConfig(directions=70_000)
+        MappedLattice(directions=70_000)
     with pytest.raises(ConfigError):
         build_viewpoint_map(make_scorer("visible", LocalizationMap(Map(landmarks), CAMERA)), GRID, [30], axes)
 

@@ -11,6 +11,7 @@ import signal
 import sys
 import time
 import traceback
+from argparse import RawDescriptionHelpFormatter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import MISSING, Field, dataclass, fields, is_dataclass, replace
 from functools import cache
@@ -18,6 +19,8 @@ from importlib.metadata import entry_points
 from pathlib import Path
 from pkgutil import resolve_name
 from typing import Any, get_args, get_type_hints
+
+from jsonargparse import ArgumentError, ArgumentParser, DefaultHelpFormatter
 
 from wheretolook.utils.errors import ConfigError, WhereToLookError, did_you_mean
 from wheretolook.utils.files import MAX_PIXELS, read_yaml
@@ -217,9 +220,6 @@ def described_fields(kind: Any) -> dict[str, str]:
 
 def build_parser(name: str) -> Any:
     """Return the jsonargparse parser of a command's options."""
-    from argparse import RawDescriptionHelpFormatter
-
-    from jsonargparse import ArgumentParser, DefaultHelpFormatter
 
     class HelpFormatter(RawDescriptionHelpFormatter, DefaultHelpFormatter):
         """Keeps the line breaks of a command's description."""
@@ -251,8 +251,6 @@ def parse_command(name: str, arguments: Sequence[str]) -> Any:
 
     Raises ConfigError for an option that does not exist, or a value of the wrong kind or out of range.
     """
-    from jsonargparse import ArgumentError
-
     command = load_command(name)
     options = {known: option.kind for known, option in command_options(command).items()}
     given, files = read_arguments(command, options, arguments)

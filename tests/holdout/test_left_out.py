@@ -10,10 +10,11 @@ import pytest
 from holdout.corridor import write_corridor
 from synthetic_dataset import make_dataset
 from wheretolook.cli import main, parse_command
+from wheretolook.commands.check import WORK
 from wheretolook.commands.evaluate import evaluate_methods
 from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.holdout.holdout import hold_out_blocks
-from wheretolook.holdout.photo_map import WORK, open_map
+from wheretolook.holdout.photo_map import open_map
 from wheretolook.holdout.scores import evaluated_photographs
 from wheretolook.mapping.config import FrameOptions
 from wheretolook.scorers.set.network import SetNetwork

@@ -29,7 +29,6 @@ from wheretolook.mapping.map_folder import MapRun
 from wheretolook.mapping.map_frame import read_frame
 from wheretolook.mapping.photograph_map import map_photographs
 from wheretolook.mapping.photographs import PhotographCameras
-from wheretolook.planning.config import ViewpointMapConfig
 from wheretolook.scorers.visible import VisibleScorer
 from wheretolook.space.config import MappedSpaceConfig
 from wheretolook.utils.errors import MapError, SceneError
@@ -221,8 +220,8 @@ def test_a_scene_of_photographs_is_sampled_and_scored_but_not_labelled(experimen
     with pytest.raises(SceneError):
         run(Label, metric)
     said.clear()
-    views_of_map = ViewpointMapConfig(grid=(6, 4, 3), directions=40, method="visible")
-    (found,) = run(BuildViewpointMap, replace(metric, viewpoint_map=views_of_map), said.append).values()
+    views_of_map = {"grid": (6, 4, 3), "directions": 40, "method": "visible"}
+    (found,) = run(BuildViewpointMap, replace(metric, views=views_of_map), said.append).values()
     assert found.origin.occlusion == "hidden-points" and set(found.voxel_of_row) <= set(table["location_id"])
     best = found.best(camera_centers(views)[0])
     assert best.n_visible > 0

@@ -4,7 +4,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from wheretolook_paper.evaluation.relocalization import summarize, summary_markdown
+from wheretolook_paper.relocalization import summarize, summary_markdown
 from wheretolook_paper.studies.fit_confidence import fit, is_within, predict
 
 

@@ -10,7 +10,7 @@ from wheretolook.geometry.poses import pan_tilt_angles, pan_tilt_turns_deg, rota
 from wheretolook.geometry.poses import turns_deg as turns_deg_of_cameras
 from wheretolook.planning.config import PathConfig
 from wheretolook.planning.routes import turned_evenly
-from wheretolook.planning.rrt import PathRequest, are_separate, plan_path
+from wheretolook.planning.rrt import are_separate, plan_path
 from wheretolook.planning.viewpoint_map import MapOrigin, ViewpointMap
 from wheretolook.utils.errors import ConfigError, PlanningError
 
@@ -147,7 +147,7 @@ class TwoRooms(ClosedRoom):
 
 
 def test_separate_rooms_are_named_as_the_cause():
-    assert not are_separate(PathRequest(np.array([START, GOAL]), np.array(BOUNDS), Room(), QUICK))
+    assert not are_separate(np.array([START, GOAL]), Room(), np.array(BOUNDS))
     with pytest.raises(PlanningError, match="separate parts"):
         plan_path(START, GOAL, TwoRooms(), BOUNDS, config=replace(QUICK, time_s=0.3), progress=False)
 

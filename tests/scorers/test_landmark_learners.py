@@ -26,7 +26,7 @@ from wheretolook.scorers.set.network import (
 )
 from wheretolook.training.data import labelled_rows
 from wheretolook.training.landmark_views import LandmarkBatches, load_landmark_views
-from wheretolook.training.scenes import training_scenes
+from wheretolook.training.provenance import training_scenes
 
 DISTANCE = ATTRIBUTES.index("distance")
 NO_STATISTICS = FeatureStatistics(ATTRIBUTES, (0.0,) * len(ATTRIBUTES), (1.0,) * len(ATTRIBUTES))

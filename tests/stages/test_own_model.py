@@ -30,7 +30,6 @@ from wheretolook.geometry.views import Views
 from wheretolook.mapping.colmap_model import colmap_poses, read_model
 from wheretolook.mapping.config import FrameOptions, ImportConfig, MarkerConfig, PhotographsConfig
 from wheretolook.mapping.imported_map import map_existing
-from wheretolook.planning.config import ViewpointMapConfig
 from wheretolook.rendering.raycasting import MeshRaycaster
 from wheretolook.scenes.loading import save_glb
 from wheretolook.space.config import MappedSpaceConfig
@@ -76,7 +75,7 @@ def experiment_of(model, data, **existing):
         mapped_space=MappedSpaceConfig(max_camera_distance_m=0.6),
         source={"model": model, "scale": 1, **existing},
         sample=SampleConfig(grid=(6, 5, 3), directions=40, keep=10, max_locations=6),
-        viewpoint_map=ViewpointMapConfig(grid=(6, 5, 3), directions=30, method="visible"),
+        views={"grid": (6, 5, 3), "directions": 30, "method": "visible"},
         tracking=TrackingConfig(str(data / "mlruns")),
     )
 

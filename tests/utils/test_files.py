@@ -21,7 +21,7 @@ from wheretolook.dataset.layout import Dataset, SceneFolder
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.mapping.depth_images import read_depth
 from wheretolook.mapping.photographs import read_photograph
-from wheretolook.training.scenes import with_also
+from wheretolook.training.provenance import with_also
 from wheretolook.utils.errors import ConfigError, MapError, TableError
 from wheretolook.utils.files import (
     MAX_TEXT_BYTES,

@@ -16,7 +16,7 @@ from wheretolook.commands.select import Select
 from wheretolook.commands.view import View
 from wheretolook.commands.viewpoint_map import BuildViewpointMap
 from wheretolook.dataset.dataset_lock import changing
-from wheretolook.planning.config import PlanConfig, ViewpointMapConfig
+from wheretolook.planning.config import PlanConfig
 from wheretolook.select.waypoints import read_waypoints
 from wheretolook.utils.errors import ConfigError, MapError, StorageError, TableError
 from wheretolook.utils.files import check_folder_name, check_output, read_text, write_text
@@ -79,7 +79,7 @@ def test_commands_check_their_outputs(tmp_path, capsys):
     for command in (
         Export(map=tmp_path / "model", out=tmp_path),
         Plan(data=tmp_path / "data", plan=PlanConfig(out=tmp_path)),
-        BuildViewpointMap(data=tmp_path / "data", viewpoint_map=ViewpointMapConfig(out=waypoints)),
+        BuildViewpointMap(data=tmp_path / "data", out=waypoints),
     ):
         with pytest.raises(ConfigError, match="this holds something else"):
             command.run()

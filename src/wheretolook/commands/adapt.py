@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shutil
 import time
-import warnings
 from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,7 +12,7 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from wheretolook.commands.check import check_name, hold_out_photographs, knows_photographs
+from wheretolook.commands.check import check_name, folder_of_check, hold_out_photographs, knows_photographs
 from wheretolook.commands.options import (
     LabelOptions,
     Log,
@@ -26,26 +25,16 @@ from wheretolook.commands.options import (
     scene_job,
 )
 from wheretolook.dataset.dataset_lock import reading
-from wheretolook.dataset.layout import Dataset, SceneFolder, views_by_camera
+from wheretolook.dataset.layout import Dataset, SceneFolder
 from wheretolook.dataset.scene import ColmapFiles, Scene
-from wheretolook.geometry.poses import camera_centers
 from wheretolook.mapping.colmap_model import read_model
 from wheretolook.mapping.config import FrameOptions, place_name
 from wheretolook.mapping.map_frame import find_frame
-from wheretolook.scorers.weights import load_scorer, resolve_weights
+from wheretolook.scorers.weights import resolve_weights
 from wheretolook.tracking import TrackingConfig, check_store, kept_if_not_logged, start_run
 from wheretolook.tracking import log as log_to_run
-from wheretolook.utils.errors import (
-    ConfigError,
-    MapError,
-    OutOfRangeWarning,
-    SceneError,
-    TableError,
-    check_positive,
-    check_range,
-    reject,
-)
-from wheretolook.utils.files import fingerprint, missing_folders, remove_if_empty, storage_errors, write_text
+from wheretolook.utils.errors import ConfigError, MapError, SceneError, TableError, check_positive, check_range, reject
+from wheretolook.utils.files import missing_folders, remove_if_empty, storage_errors, write_text
 from wheretolook.utils.processes import hold
 
 if TYPE_CHECKING:
@@ -59,43 +48,6 @@ if TYPE_CHECKING:
 FOLDER = "adapted"  # of a dataset: adapted weights, and what they have gained
 MIN_OF_EACH_LABEL = 10
 _VIEWS_PER_TASK = 128  # the time is checked after each task
-
-
-@dataclass(frozen=True)
-class AdaptConfig:
-    """How weights are adapted to a scene.
-
-    Args:
-        scene: name of the scene; may be empty if the dataset has only one.
-        map: instead of a scene: folder of a COLMAP model, in metres with z up, whose photographs are held out.
-        images: folder of the map's photographs, to extract their features again.
-        database: features that the map was made from: COLMAP's `database.db`, or hloc's in HDF5. Empty for those next to
-            the map.
-        weights: file of weights of `set` to start from; empty for the bundled ones.
-        out: file of weights to write; empty for `<data>/<name>/adapted/<scene>.safetensors`, of a map
-            `<data>/checks/<map>/adapted.safetensors`.
-        minutes: time for labelling rendered views, if the scene has a mesh and its views have no labels yet.
-        seed: decides which locations are labelled first, and which views are held out together.
-    """
-
-    scene: str = ""
-    map: Path | None = None
-    images: Path | None = None
-    database: Path | None = None
-    weights: Path | None = None
-    out: Path | None = None
-    minutes: float = 10.0
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        if self.scene and self.map is not None:
-            raise ConfigError("weights are adapted to a scene or to a map", value=self.scene, fix="Give one of them.")
-        if self.images is not None and self.database is not None:
-            raise ConfigError(
-                "features come from a database or from images", value=self.images, fix="Give one of them."
-            )
-        check_positive("minutes", self.minutes)
-        check_range("seed", self.seed, 0)
 
 
 @dataclass(frozen=True)
@@ -123,15 +75,40 @@ class Adapt(SceneOptions, LabelOptions, FrameOptions):
       wheretolook adapt --config configs/demo.yaml --scene apartment-000 --minutes 5
 
     Args:
-        adapt: which scene or map, its photographs, and the weights.
+        scene: name of the scene; may be empty if the dataset has only one.
+        map: instead of a scene: folder of a COLMAP model, in metres with z up, whose photographs are held out.
+        images: folder of the map's photographs, to extract their features again.
+        database: features that the map was made from: COLMAP's `database.db`, or hloc's in HDF5. Empty for those next to
+            the map.
+        weights: file of weights of `set` to start from; empty for the bundled ones.
+        out: file of weights to write; empty for `<data>/<name>/adapted/<scene>.safetensors`, of a map
+            `<data>/checks/<map>/adapted.safetensors`.
+        minutes: time for labelling rendered views, if the scene has a mesh and its views have no labels yet.
+        seed: decides which locations are labelled first, and which views are held out together.
         tracking: where MLflow keeps its runs.
     """
 
     SHORT: ClassVar = {"engine": "label.engine"}
     GROUPS: ClassVar = {"adapt": ""}
 
-    adapt: AdaptConfig = field(default_factory=AdaptConfig)
+    scene: str = ""
+    map: Path | None = None
+    images: Path | None = None
+    database: Path | None = None
+    weights: Path | None = None
+    out: Path | None = None
+    minutes: float = 10.0
+    seed: int = 0
     tracking: TrackingConfig = field(default_factory=TrackingConfig)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        reject(
+            (bool(self.scene) and self.map is not None, "weights are adapted to either --scene or --map", self.scene),
+            (bool(self.images and self.database), "features come from either --database or --images", str(self.images)),
+        )
+        check_positive("minutes", self.minutes)
+        check_range("seed", self.seed, 0)
 
     def run(self, log: Log = print, progress: Progress = ignore_progress) -> Path | None:
         """Adapt a set scorer to one scene, or to a COLMAP map of photographs, by views that were localized there.
@@ -147,27 +124,30 @@ class Adapt(SceneOptions, LabelOptions, FrameOptions):
             WeightsError: the weights to start from are not of the method `set`.
             MapError: the map of a scene is not in metres, or its photographs' features are not known.
         """
-        config = self.adapt
         frame = self.frame_options()
-        appearance = config.map and self.label.appearance
+        appearance = self.map and self.label.appearance
         changes = self.label.changes
         reject(
-            (config.map is None and frame != FrameOptions(), "the map's scale and up belong to --map", vars(frame)),
+            (self.map is None and frame != FrameOptions(), "the map's scale and up belong to --map", vars(frame)),
             (bool(appearance), "label.appearance is for renders, not for the photographs of --map", appearance),
             (bool(changes), "label.changes is for the label command, whose labels are then adapted to", changes),
         )
-        if config.map is not None:
-            return self._adapt_map(config.map, log, progress)
+        if self.map is not None:
+            return self._adapt_map(self.map, log, progress)
         refuse_release(self.root)
         with reading(self.root, "adapt", FOLDER):
             dataset = Dataset.load(self.root)
-            files = _scene(dataset, config.scene)
+            files = _scene(dataset, self.scene)
             scene = open_scene(self, files)
             path = dataset.root / FOLDER / f"{files.name}.safetensors"
             target = self._target(files.name, path, dataset)
-            has_photographs = knows_photographs(files, config.images, config.database)
+            has_photographs = knows_photographs(files, self.images, self.database)
             table = self._labelled(files, scene, has_photographs, log)
-            views = None if table is None else labelled_views(files, scene, table, target.weights)
+            views = None
+            if table is not None:
+                from wheretolook.evaluation.adaptation import labelled_views
+
+                views = labelled_views(files, scene, table, target.weights)
             if has_photographs:
                 try:
                     name = check_name(self, files)
@@ -184,8 +164,6 @@ class Adapt(SceneOptions, LabelOptions, FrameOptions):
 
     def _adapt_map(self, model: Path, log: Log, progress: Progress) -> Path | None:
         """Adapt to a COLMAP map by its photographs only."""
-        from wheretolook.holdout.photo_map import folder_of_check
-
         name = place_name(model)
         target = self._target(name, folder_of_check(self.data, name) / "adapted.safetensors")
         occlusion = "none" if self.occlusion.model == "none" else "hidden-points"
@@ -201,9 +179,9 @@ class Adapt(SceneOptions, LabelOptions, FrameOptions):
     def _target(self, name: str, path: Path, dataset: Dataset | None = None) -> _Target:
         """Return what is adapted, after checks that fail before the work; `path` is the default of `adapt.out`."""
         features = "" if dataset is None else dataset.features
-        weights = resolve_weights("set", self.adapt.weights, features)
+        weights = resolve_weights("set", self.weights, features)
         assert weights is not None
-        path = self.adapt.out or path
+        path = self.out or path
         if path.suffix != ".safetensors" or path.is_dir() or path.resolve() == weights.resolve():
             fix = "Give --out the name of another file that ends in .safetensors."
             raise ConfigError("adapted weights cannot be written to this path", path=path, fix=fix)
@@ -222,7 +200,7 @@ class Adapt(SceneOptions, LabelOptions, FrameOptions):
 
         log(f"{name}: holding out blocks of photographs")
         photographs, held_out = hold_out_photographs(
-            self, "adapt", model, name, self.frame_options(), self.adapt.images, self.adapt.database
+            self, "adapt", model, name, self.frame_options(), self.images, self.database
         )
         views = photographed_views(photographs, held_out, weights, occlusion, self.warp_device)
         return views, whole_map(photographs, occlusion, self.warp_device)
@@ -231,12 +209,12 @@ class Adapt(SceneOptions, LabelOptions, FrameOptions):
         self, target: _Target, views: LocalizedViews, whole: LocalizationMap, log: Log, progress: Progress
     ) -> Path | None:
         """Adapt to localized views; keep the weights if they are better, report and log the gain."""
-        from wheretolook.evaluation.adaptation import compare_log_odds, gain_markdown
+        from wheretolook.evaluation.adaptation import compare_log_odds, gain_markdown, save_adapted
         from wheretolook.scorers.adapted.calibration import adapt as fit
 
         name = target.name
         path = target.path
-        seed = self.adapt.seed
+        seed = self.seed
         photographs = views.photograph >= 0
         kinds = {"rendered views": ~photographs, "held-out photographs": photographs}
         counts = " and ".join(f"{rows.sum():,} {kind}" for kind, rows in kinds.items() if rows.any())
@@ -258,11 +236,11 @@ class Adapt(SceneOptions, LabelOptions, FrameOptions):
             text += f"\nPhotographs only:\n\n{gain_markdown(of_photographs)}"
         write_text(path.with_suffix(".md"), f"# {name}: adapted by {counts}\n\n{text}")
         if is_better:
-            _save(target, whole, adapted, views, gain)
+            save_adapted(path, target.weights, whole, adapted, {"scene": name, **_counts(views)}, gain)
             log(f"{text}\n{name}: the adapted weights are better -> {path}")
         else:
             log(f"{text}\n{name}: adapting does not make the weights better here: use {target.weights}")
-            if self.adapt.out is None:
+            if self.out is None:
                 path.unlink(missing_ok=True)  # of an earlier run, by other labels
         with kept_if_not_logged(f"the gain of adapting, {path.with_suffix('.md')},"):
             self._log_gain(target, adapted, views, gain, is_better)
@@ -306,12 +284,12 @@ class Adapt(SceneOptions, LabelOptions, FrameOptions):
 
         from wheretolook.localization.labeller import LabelTask, label_scenes
 
-        minutes = self.adapt.minutes
+        minutes = self.minutes
         table = files.read_table()
         if table.empty:
             return table
         ids, row = np.unique(table["location_id"].to_numpy(), return_inverse=True)
-        order = np.random.default_rng(self.adapt.seed).permutation(len(ids))[row.reshape(-1)]
+        order = np.random.default_rng(self.seed).permutation(len(ids))[row.reshape(-1)]
         table = table.iloc[np.argsort(order, kind="stable")].reset_index(drop=True)
         job = scene_job(files, self.label, extractor_of(files, self.extractor), scene.device)
         tasks = []
@@ -343,25 +321,6 @@ def _scene(dataset: Dataset, name: str) -> SceneFolder:
     return dataset.scenes[0]
 
 
-def labelled_views(files: SceneFolder, scene: Scene, table: pd.DataFrame, weights: Path) -> LocalizedViews:
-    """Return the labelled views of a scene with the log-odds that the weights give them."""
-    from wheretolook.dataset.viewpoint_table import is_good, poses
-    from wheretolook.scorers.adapted.calibration import LocalizedViews
-    from wheretolook.scorers.adapted.score import log_odds_of
-
-    cam_from_world = poses(table)
-    log_odds = np.empty(len(table))
-    for camera, rows in views_by_camera(files, table):
-        own = scene.localization_map.of_camera(camera) if scene.map.has_photographs else None
-        scorer = load_scorer(own or files.localization_map(camera, scene.device), weights)
-        with warnings.catch_warnings():  # how accurate the weights are here is what is measured
-            warnings.simplefilter("ignore", OutOfRangeWarning)
-            log_odds[rows] = log_odds_of(scorer.score(cam_from_world[rows]))
-    axes = cam_from_world[:, 2, :3]
-    group = table["location_id"].to_numpy(np.int64)
-    return LocalizedViews.rendered(log_odds, is_good(table), camera_centers(cam_from_world), axes, group)
-
-
 def _check_enough(views: LocalizedViews, source: Path) -> None:
     """Raise TableError if there are too few views of either label to fit to."""
     n_good = int(views.good.sum())
@@ -380,22 +339,3 @@ def _check_enough(views: LocalizedViews, source: Path) -> None:
 
 def _counts(views: LocalizedViews) -> dict[str, object]:
     return {"views": len(views), "photographs": int((views.photograph >= 0).sum())}
-
-
-def _save(target: _Target, whole: LocalizationMap, adapted: Adapted, views: LocalizedViews, gain: Gain) -> None:
-    import torch
-
-    from wheretolook.scorers.adapted.score import AdaptedNetwork
-    from wheretolook.scorers.set.network import SetNetwork
-    from wheretolook.scorers.set.score import for_map
-    from wheretolook.training.trained_network import TrainedNetwork
-
-    base = for_map(TrainedNetwork.load(target.weights, SetNetwork, "set", device=whole.device), whole)
-    points = whole.landmarks.points
-    # the scene is recognized by as many landmarks
-    n_signature = min(256, len(points))
-    network = AdaptedNetwork(base.network, base.scale, base.offset, n_signature)
-    network.place[:] = torch.from_numpy(points[np.arange(n_signature) * len(points) // max(1, n_signature)])
-    trained = TrainedNetwork("adapted", network, base.camera, adapted.scale, adapted.offset, base.training_range)
-    about = {"scene": target.name, **_counts(views), "weights_sha256": fingerprint(target.weights)}
-    trained.save(target.path, {**about, "before": gain.before, "after": gain.after})

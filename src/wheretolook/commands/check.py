@@ -20,6 +20,7 @@ from wheretolook.scorers.registry import check_method
 from wheretolook.training.weights import read_training
 from wheretolook.utils.devices import usable_device
 from wheretolook.utils.errors import MapError, check_range, reject
+from wheretolook.utils.files import safe_child
 from wheretolook.utils.processes import cores, hold
 
 if TYPE_CHECKING:
@@ -29,6 +30,15 @@ if TYPE_CHECKING:
     from wheretolook.visibility.occlusion import OcclusionModel
 
 
+CHECKS = "checks"  # folder of the folders of checks, next to the datasets
+WORK = "work"  # folder of cached work, in that of a check
+
+
+def folder_of_check(data: Path, name: str) -> Path:
+    """Return the folder of a check's results, by its name; ConfigError if it would be outside the folder of checks."""
+    return safe_child(safe_child(data, CHECKS, "the folder of all checks"), name, "the name of a check")
+
+
 def knows_photographs(files: SceneFolder, images: Path | None = None, database: Path | None = None) -> bool:
     """Return whether the photographs that a scene's map was made from, or their features, are known."""
     return holds_model(files.map) and any((images, database, find_features(files.map), find_photographs(files.map)))
@@ -36,8 +46,6 @@ def knows_photographs(files: SceneFolder, images: Path | None = None, database: 
 
 def check_name(options: LabelOptions, files: SceneFolder) -> str:
     """Return the folder name of a scene's check: that of `check --name`, unless only that of `check` exists."""
-    from wheretolook.holdout.photo_map import CHECKS
-
     names = f"{options.name}-{files.name}", files.name
     return next((name for name in names if (options.data / CHECKS / name).is_dir()), names[0])
 
@@ -57,7 +65,7 @@ def hold_out_photographs(
     `wheretolook.holdout.photo_map.open_map` for the other arguments and errors.
     """
     from wheretolook.holdout.holdout import hold_out_blocks
-    from wheretolook.holdout.photo_map import WORK, features_of, folder_of_check, open_map
+    from wheretolook.holdout.photo_map import features_of, open_map
 
     out = folder_of_check(options.data, name)
     workers = options.n_workers
@@ -158,7 +166,6 @@ class Check(ScorerOptions, FrameOptions):
             model_suffix(self.map)
         # the imports above are light, those below take seconds
         from wheretolook.figures.floor_plan import save_figure
-        from wheretolook.holdout.photo_map import WORK, folder_of_check
         from wheretolook.holdout.report import check_figure, check_map
         from wheretolook.holdout.scores import Scoring
 

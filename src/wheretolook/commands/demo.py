@@ -18,7 +18,7 @@ from wheretolook.commands.sample import Sample
 from wheretolook.commands.scenes import Scenes
 from wheretolook.commands.train import Train
 from wheretolook.dataset.layout import STAGES, Dataset
-from wheretolook.evaluation.config import EvaluateConfig
+from wheretolook.evaluation.config import SCORES_CSV, SCORES_MD, SCORES_PNG, EvaluateConfig, results_folder
 from wheretolook.scorers.registry import methods_named, scorers
 from wheretolook.scorers.train_config import TrainConfig
 from wheretolook.scorers.weights import resolve_weights
@@ -100,8 +100,6 @@ def compare(options: Demo, log: Log, progress: Progress) -> None:
 
     Raises what `evaluate_methods` does.
     """
-    from wheretolook.evaluation.results import SCORES_CSV, SCORES_MD, results_folder
-
     dataset = load_dataset(options, "label")
     config = options.evaluate
     tracking = options.tracking
@@ -140,14 +138,7 @@ def _update(bar: tqdm, seconds: float, work: float) -> None:
 
 def _print_results(options: Demo) -> None:
     """Print which method chose best, and where the picture, tables and runs are."""
-    from wheretolook.evaluation.results import (
-        SCORES_CSV,
-        SCORES_MD,
-        SCORES_PNG,
-        best_in_words,
-        read_scores,
-        results_folder,
-    )
+    from wheretolook.evaluation.results import best_in_words, read_scores
 
     results = results_folder(Dataset.load(options.root), options.evaluate)
     picture = options.root / "results" / OVERVIEW

@@ -19,7 +19,7 @@ from wheretolook.commands.options import (
 )
 from wheretolook.dataset.dataset_lock import reading, reads_dataset
 from wheretolook.dataset.layout import Dataset
-from wheretolook.evaluation.config import EvaluateConfig
+from wheretolook.evaluation.config import CALIBRATION_CSV, SCORES_CSV, EvaluateConfig, results_folder
 from wheretolook.scorers.registry import describe_methods
 from wheretolook.tracking import TrackingConfig, check_store, kept_if_not_logged
 from wheretolook.utils.errors import MapError
@@ -140,7 +140,7 @@ def evaluate_methods(
         TrackingError: the tracking store cannot be used. If it fails later, the results are kept, and a TrackingWarning
             says that they are not logged.
     """
-    from wheretolook.evaluation.results import best_in_words, log_evaluation, results_folder
+    from wheretolook.evaluation.results import best_in_words, log_evaluation
     from wheretolook.evaluation.scoring import compare_methods
 
     title = f"Localization score on {dataset.name}" + (f", {config.split} scenes" if config.split != "test" else "")
@@ -166,8 +166,6 @@ def write_results(folder: Path, table: pd.DataFrame, calibration: pd.DataFrame, 
 
     The curves of an earlier evaluation are removed.
     """
-    from wheretolook.evaluation.results import CALIBRATION_CSV, SCORES_CSV
-
     write_text(folder / SCORES_CSV, table.to_csv(index=False))
     (folder / CALIBRATION_CSV).unlink(missing_ok=True)
     if len(calibration):

@@ -32,8 +32,8 @@ from wheretolook.training.provenance import (
     params_of,
     trained_before,
     weights_path,
+    with_also,
 )
-from wheretolook.training.scenes import with_also
 from wheretolook.training.weights import read_record
 from wheretolook.utils.errors import TrackingError
 from wheretolook.utils.files import safe_child, sha256, temporary_folder, write_json, write_text

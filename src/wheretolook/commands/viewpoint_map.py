@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
 from wheretolook.commands.map import SceneOrMapOptions, imports_map
 from wheretolook.commands.options import Log, Progress, ignore_progress, load_dataset, naming_file, open_scene
 from wheretolook.dataset.dataset_lock import reads_dataset
-from wheretolook.planning.config import ViewpointMapConfig
+from wheretolook.planning.config import MappedLattice
 from wheretolook.scorers.weights import resolve_weights
 from wheretolook.utils.errors import ConfigError
 
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
-class BuildViewpointMap(SceneOrMapOptions):
+class BuildViewpointMap(MappedLattice, SceneOrMapOptions):
     """Score every direction at every free voxel of a scene, for planners to query. Needs no labels.
 
     Reads a scene's map and its mesh, as `scenes` and `map` leave them, or a COLMAP model (--map); a scene of photographs has no mesh, and is free
@@ -33,13 +34,30 @@ class BuildViewpointMap(SceneOrMapOptions):
       wheretolook viewpoint-map --map sparse/0 --mesh scan.glb --out house.map
 
     Args:
-        viewpoint_map: which views, and how they are scored.
+        scene: name of the scene; empty for all scenes of the dataset.
+        method: method that scores the views. See `wheretolook evaluate --list-methods`; empty for the one that the
+            weights are of, or bins if there are none.
+        accuracy: limits of the errors in metres and degrees that the scores refer to, for the method set; by default
+            those of the weights, 0.05,0.4.
+        weights: file of weights that the train stage wrote, for a learned method. Unless a method is named,
+            the best of the dataset, or else of those that ship, for cameras with their field of view.
+        out: folder to write; empty for `<data>/<name>/<scene>/viewpoint-map`. Of one scene only.
+        anywhere: allow weights adapted to another scene.
     """
 
     GROUPS: ClassVar = {"viewpoint_map": ""}
     WRITES: ClassVar = "viewpoint_map.json"
 
-    viewpoint_map: ViewpointMapConfig = field(default_factory=ViewpointMapConfig)
+    scene: str = ""
+    method: str = ""
+    accuracy: tuple[float, float] | None = None
+    weights: Path | None = None
+    out: Path | None = None
+    anywhere: bool = False
+
+    def __post_init__(self) -> None:
+        MappedLattice.__post_init__(self)
+        SceneOrMapOptions.__post_init__(self)
 
     @imports_map
     @reads_dataset("viewpoint-map")
@@ -53,23 +71,22 @@ class BuildViewpointMap(SceneOrMapOptions):
         from wheretolook.planning.scene_map import scene_scorer, scene_viewpoint_map
 
         dataset = load_dataset(self, "map")
-        config = self.viewpoint_map
-        name = config.scene or self.imported_name
+        name = self.scene or self.imported_name
         scenes = (dataset.scene(name),) if name else dataset.scenes
-        if config.out is not None and len(scenes) != 1:
-            raise ConfigError("--out is the folder of one scene", value=str(config.out), fix="Give --scene.")
-        if not config.method and config.weights is None:
+        if self.out is not None and len(scenes) != 1:
+            raise ConfigError("--out is the folder of one scene", value=str(self.out), fix="Give --scene.")
+        weights = self.weights
+        if not self.method and weights is None:
             weights = resolve_weights(dataset=dataset, log=log)
             if weights is not None:
                 log(f"scored by {weights}")
-                config = replace(config, weights=weights)
         built: dict[str, ViewpointMap] = {}
         for files in scenes:
             scene = open_scene(self, files)
             with naming_file(scene.folder.source):
-                scorer = scene_scorer(scene, config.method, config.weights, config.anywhere, config.accuracy)
-                viewpoint_map = scene_viewpoint_map(scene, config, scorer)
-            folder = config.out or files.folder / "viewpoint-map"
+                scorer = scene_scorer(scene, self.method, weights, self.anywhere, self.accuracy)
+                viewpoint_map = scene_viewpoint_map(scene, self, scorer)
+            folder = self.out or files.folder / "viewpoint-map"
             viewpoint_map.save(folder)
             built[scene.name] = viewpoint_map
             n_rows, n_directions = viewpoint_map.scores.shape

@@ -1,17 +1,34 @@
-"""Compare a scorer before and after adaptation to a scene, on views that it was not fitted on."""
+"""Adapt a scorer to a scene: its labelled views, the comparison before and after, and the adapted weights."""
 
 from __future__ import annotations
 
+import warnings
+from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pandas as pd
+import torch
 from numpy.typing import NDArray
 from scipy.special import expit
 from sklearn.metrics import roc_auc_score
 
+from wheretolook.dataset.layout import SceneFolder, views_by_camera
+from wheretolook.dataset.scene import Scene
+from wheretolook.dataset.viewpoint_table import is_good, poses
 from wheretolook.evaluation.statistics import ClusterBootstrap, expected_calibration_error
-from wheretolook.geometry.poses import Float
-from wheretolook.scorers.adapted.calibration import log_losses
+from wheretolook.geometry.poses import Float, camera_centers
+from wheretolook.inputs.localization_map import LocalizationMap
+from wheretolook.scorers.adapted.calibration import Adapted, LocalizedViews, log_losses
+from wheretolook.scorers.adapted.score import AdaptedNetwork, log_odds_of
+from wheretolook.scorers.set.network import SetNetwork
+from wheretolook.scorers.set.score import for_map
+from wheretolook.scorers.weights import load_scorer
+from wheretolook.training.trained_network import TrainedNetwork
+from wheretolook.utils.errors import OutOfRangeWarning
+from wheretolook.utils.files import fingerprint
 from wheretolook.utils.texts import markdown_table
 
 Interval = tuple[float, float, float]  # value, lower and upper end of its 95 % interval
@@ -104,3 +121,33 @@ def gain_markdown(gain: Gain) -> str:
     else:
         summary += ", regret by {:+.1f} points [{:+.1f}, {:+.1f}].".format(*gain.regret_less)
     return f"{markdown_table(('', 'before', 'adapted'), rows)}\n\n{summary}\n"
+
+
+def labelled_views(files: SceneFolder, scene: Scene, table: pd.DataFrame, weights: Path) -> LocalizedViews:
+    """Return the labelled views of a scene with the log-odds that the weights give them."""
+    cam_from_world = poses(table)
+    log_odds = np.empty(len(table))
+    for camera, rows in views_by_camera(files, table):
+        own = scene.localization_map.of_camera(camera) if scene.map.has_photographs else None
+        scorer = load_scorer(own or files.localization_map(camera, scene.device), weights)
+        with warnings.catch_warnings():  # how accurate the weights are here is what is measured
+            warnings.simplefilter("ignore", OutOfRangeWarning)
+            log_odds[rows] = log_odds_of(scorer.score(cam_from_world[rows]))
+    axes = cam_from_world[:, 2, :3]
+    group = table["location_id"].to_numpy(np.int64)
+    return LocalizedViews.rendered(log_odds, is_good(table), camera_centers(cam_from_world), axes, group)
+
+
+def save_adapted(
+    path: Path, weights: Path, whole: LocalizationMap, adapted: Adapted, about: Mapping[str, Any], gain: Gain
+) -> None:
+    """Write the weights of the method `set` in a file, adapted to a scene whose whole map is given, and their gain."""
+    base = for_map(TrainedNetwork.load(weights, SetNetwork, "set", device=whole.device), whole)
+    points = whole.landmarks.points
+    # the scene is recognized by as many landmarks
+    n_signature = min(256, len(points))
+    network = AdaptedNetwork(base.network, base.scale, base.offset, n_signature)
+    network.place[:] = torch.from_numpy(points[np.arange(n_signature) * len(points) // max(1, n_signature)])
+    trained = TrainedNetwork("adapted", network, base.camera, adapted.scale, adapted.offset, base.training_range)
+    about = {**about, "weights_sha256": fingerprint(weights)}
+    trained.save(path, {**about, "before": gain.before, "after": gain.after})

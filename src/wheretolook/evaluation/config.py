@@ -1,4 +1,4 @@
-"""Options of evaluation."""
+"""Options of evaluation, and where its files are."""
 
 from __future__ import annotations
 
@@ -10,10 +10,20 @@ from typing import Literal
 import numpy as np
 
 from wheretolook.dataset.config import THRESHOLDS
+from wheretolook.dataset.layout import Dataset
 from wheretolook.scorers.registry import methods_named, scorers
 from wheretolook.utils.errors import ConfigError, check_choice, check_positive, check_range, no_option
 from wheretolook.utils.package import or_shipped
 from wheretolook.visibility.config import check_occlusion_names
+
+SCORES_CSV = "scores.csv"
+SCORES_MD = "scores.md"
+SCORES_PNG = "scores.png"
+CALIBRATION_CSV = "calibration.csv"
+"""Files of an evaluation, in `<dataset>/results/` and as artifacts of its run."""
+
+VARIANTS_CSV = "variants.csv"
+"""In a release's `results/`: scores of the networks for all inputs, as `scores.csv`, before one was chosen to ship."""
 
 
 def _all_methods() -> tuple[str, ...]:
@@ -96,3 +106,9 @@ def check_heading(heading: Sequence[Sequence[float]]) -> None:
 def candidates_label(best: int) -> str:
     """Name of a candidate set in the column `candidates`: "all" for 0, else such as "best 100"."""
     return f"best {best}" if best else "all"
+
+
+def results_folder(dataset: Dataset, config: EvaluateConfig) -> Path:
+    """Return the folder of an evaluation's files: `<dataset>/results/`, and a folder in it for other splits than test."""
+    folder = dataset.root / "results"
+    return folder if config.split == "test" else folder / config.split

@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 from wheretolook.dataset.config import ALL, threshold_key, threshold_label
 from wheretolook.dataset.layout import Dataset, SceneFolder
 from wheretolook.dataset.viewpoint_table import FIRST
-from wheretolook.evaluation.config import EvaluateConfig
+from wheretolook.evaluation.config import SCORES_CSV, EvaluateConfig
 from wheretolook.evaluation.ranking import (
     TopN,
     choose_at_random,
@@ -312,16 +312,6 @@ def _calibration_metrics(method: str, good: NDArray[np.bool_], scores: Float, te
     return metrics
 
 
-SCORES_CSV = "scores.csv"
-SCORES_MD = "scores.md"
-SCORES_PNG = "scores.png"
-CALIBRATION_CSV = "calibration.csv"
-"""Files of an evaluation, in `<dataset>/results/` and as artifacts of its run."""
-
-VARIANTS_CSV = "variants.csv"
-"""In a release's `results/`: scores of the networks for all inputs, as `scores.csv`, before one was chosen to ship."""
-
-
 @dataclass(frozen=True, eq=False)
 class ScoredSet:
     """Scores, choices and score table of one candidate set by one occlusion model."""
@@ -343,12 +333,6 @@ class Evaluation:
     scored: Sequence[ScoredSet]  # for each occlusion model and candidate set
     table: pd.DataFrame  # their score tables, one below the other
     calibration: pd.DataFrame  # reliability curves of learned methods, see `calibration_rows`; empty without any
-
-
-def results_folder(dataset: Dataset, config: EvaluateConfig) -> Path:
-    """Return the folder of an evaluation's files: `<dataset>/results/`, and a folder in it for other splits than test."""
-    folder = dataset.root / "results"
-    return folder if config.split == "test" else folder / config.split
 
 
 def evaluation_params(dataset: Dataset, scenes: Sequence[SceneFolder], weights: Iterable[Path]) -> dict[str, Any]:

@@ -28,7 +28,7 @@ from wheretolook.mapping.landmarks import load_colmap_landmarks
 from wheretolook.mapping.map import Map, find_source
 from wheretolook.mapping.map_frame import IDENTITY, MapFrame, find_frame, has_photographs
 from wheretolook.utils.errors import ConfigError, MapError, MapWarning
-from wheretolook.utils.files import ArtifactCache, cache_key, fingerprint, safe_child, size_and_time
+from wheretolook.utils.files import ArtifactCache, cache_key, fingerprint, size_and_time
 from wheretolook.utils.texts import LOG
 
 PANS = (0.0, -1.0, 1.0)  # of the crops of a photograph: the middle one, and those at its left and right side
@@ -62,8 +62,6 @@ def crop_pixels(camera: Camera, pixels: Float, fov_deg: float, crop: int) -> tup
 
 
 MAX_ERROR_M, MAX_ERROR_DEG = THRESHOLDS[0]  # below both, a photograph counts as localized
-CHECKS = "checks"  # folder of the folders of checks, next to the datasets
-WORK = "work"  # folder of cached work, in that of a check
 
 
 @dataclass(frozen=True, eq=False)
@@ -238,11 +236,6 @@ def _check_photographs(model: Any, model_dir: Path) -> None:
 
 def _fingerprints(model_dir: Path) -> list[str]:
     return [fingerprint(path) for path in sorted(model_dir.glob("*.bin")) + sorted(model_dir.glob("*.txt"))]
-
-
-def folder_of_check(data: Path, name: str) -> Path:
-    """Return the folder of a check's results, by its name; ConfigError if it would be outside the folder of checks."""
-    return safe_child(safe_child(data, CHECKS, "the folder of all checks"), name, "the name of a check")
 
 
 def features_of(

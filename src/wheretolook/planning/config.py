@@ -29,30 +29,6 @@ class MappedLattice(ViewLattice):
 
 
 @dataclass(frozen=True)
-class ViewpointMapConfig(MappedLattice):
-    """What a viewpoint map is made of.
-
-    Args:
-        scene: name of the scene; empty for all scenes of the dataset.
-        method: method that scores the views. See `wheretolook evaluate --list-methods`; empty for the one that the
-            weights are of, or bins if there are none.
-        accuracy: limits of the errors in metres and degrees that the scores refer to, for the method set; by default
-            those of the weights, 0.05,0.4.
-        weights: file of weights that the train stage wrote, for a learned method. Unless a method is named,
-            the best of the dataset, or else of those that ship, for cameras with their field of view.
-        out: folder to write; empty for `<data>/<name>/<scene>/viewpoint-map`. Of one scene only.
-        anywhere: allow weights adapted to another scene.
-    """
-
-    scene: str = ""
-    method: str = ""
-    accuracy: tuple[float, float] | None = None
-    weights: Path | None = None
-    out: Path | None = None
-    anywhere: bool = False
-
-
-@dataclass(frozen=True)
 class PathConfig:
     """What a path costs, and what a camera on it can do.
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -32,16 +32,6 @@ class Space(Protocol):
 
     def segments_are_free(self, a: ArrayLike, b: ArrayLike) -> NDArray[np.bool_]:
         """Whether it may go straight from points a to points b, (N, 3) m each; (N,)."""
-
-
-@dataclass(frozen=True, eq=False)
-class PathRequest:
-    """A path to plan: `ends` (2, 3) m, start and goal; `bounds` (2, 3) m, the corners of the space to plan in."""
-
-    ends: Float
-    bounds: Float
-    space: Space
-    config: PathConfig
 
 
 class _TimeBudget:
@@ -91,17 +81,17 @@ def plan_path(
         ValueError: a point is not finite, or the axis has no direction.
     """
     ends = np.asarray([start, goal], dtype=np.float64)
-    request = PathRequest(ends, np.array(bounds, dtype=np.float64), space, config)
-    check_ends(ends, space, request.bounds)
+    corners = np.array(bounds, dtype=np.float64)
+    check_ends(ends, space, corners)
     viewpoint_map = viewpoint_map and viewpoint_map.in_frame(Similarity())
     if viewpoint_map is None and start_axis is not None:
         raise PlanningError("a start axis needs a viewpoint map", value=start_axis)
-    problem = _Problem(request, viewpoint_map)
+    problem = PathProblem(ends, corners, space, config, viewpoint_map)
     orientations = problem.start_orientations(start_axis)
     with tqdm(total=round(config.time_s, 1), desc="plan", unit="s", disable=not progress) as bar:
         budget = _TimeBudget(config.time_s, bar)
         if viewpoint_map is None:
-            path = plan_shortest(request, budget)
+            path = plan_shortest(problem, budget)
         else:
             axis = None if start_axis is None else axes_of_angles(np.degrees(orientations[0]))
             path = plan_informed(problem, RouteViews(viewpoint_map, config, axis), orientations, budget)
@@ -109,21 +99,20 @@ def plan_path(
     return path
 
 
-def plan_shortest(request: PathRequest, budget: _TimeBudget) -> PlannedPath:
+def plan_shortest(problem: PathProblem, budget: _TimeBudget) -> PlannedPath:
     """Plan the shortest path, with the camera looking ahead; PlanningError if none was found."""
-    route = _short_route(request, budget, 0.5, 1.0)  # the rest of the time is for shortening it
-    route = _shorten(route, request, budget.share(), np.random.default_rng(0))
-    samples = RouteSamples.of(route, request.config.spacing_m)
-    axes = _forward(samples.positions, np.radians(request.config.pitch_deg))
+    route = _short_route(problem, budget, 0.5, 1.0)  # the rest of the time is for shortening it
+    route = _shorten(route, problem, budget.share(), np.random.default_rng(0))
+    samples = RouteSamples.of(route, problem.config.spacing_m)
+    axes = _forward(samples.positions, *problem.pitch)
     unknown = np.full(len(samples.positions), np.nan)
     return PlannedPath(samples.positions, axes, unknown, float(samples.corners[-1]), "short route")
 
 
 def plan_informed(
-    problem: _Problem, views: RouteViews, orientations: list[tuple[float, float]], budget: _TimeBudget
+    problem: PathProblem, views: RouteViews, orientations: list[tuple[float, float]], budget: _TimeBudget
 ) -> PlannedPath:
     """Plan the cheapest path with views from a viewpoint map; PlanningError if none was found."""
-    request = problem.request
     rng = np.random.default_rng(0)
     candidates: list[tuple[PlannedPath, Float]] = []  # with their routes
 
@@ -136,8 +125,8 @@ def plan_informed(
 
     search_share = 0.3  # of the time; what the short route and the search leave is for improving the cheapest path
     try:
-        route = _short_route(request, budget, 0.25, 1 - search_share)
-        route = _shorten(route, request, budget.share(0.05), rng)
+        route = _short_route(problem, budget, 0.25, 1 - search_share)
+        route = _shorten(route, problem, budget.share(0.05), rng)
         add(views.best(route), route, "short route")
     except PlanningError:
         pass  # the search below may find one
@@ -159,17 +148,18 @@ def plan_informed(
         path = views.best(candidate)
         return None if path is None or path.cost >= limit else path.cost
 
-    better = improve(route, cost_below, best.cost, request, budget.share(), rng)
+    better = improve(route, cost_below, best.cost, problem, budget.share(), rng)
     if better is not route:
         add(views.best(better), better, "improvement")
     return cheapest()[0]
 
 
-def _short_route(request: PathRequest, budget: _TimeBudget, share: float, max_share: float) -> Float:
+def _short_route(problem: PathProblem, budget: _TimeBudget, share: float, max_share: float) -> Float:
     """Find a short route (S, 3) m in a share of the time, or up to `max_share` until there is one."""
     time_s = share * budget.total_s
     max_s = max_share * budget.total_s
-    return _Problem(request, None).solve([(0.0, 0.0)], time_s, max_s, budget.bar)[:, :3]
+    shortest = PathProblem(problem.ends, problem.bounds, problem.space, problem.config)
+    return shortest.solve([(0.0, 0.0)], time_s, max_s, budget.bar)[:, :3]
 
 
 def check_ends(ends: Float, space: Space, bounds: Float, map_from_world: Similarity = IDENTITY.world_from_map) -> None:
@@ -193,33 +183,33 @@ def check_ends(ends: Float, space: Space, bounds: Float, map_from_world: Similar
         raise PlanningError("the start is the goal", value=tuple(map_from_world.apply(ends[0]).tolist()))
 
 
-def are_separate(request: PathRequest) -> bool:
-    """Whether start and goal are in different parts of the free space, as far as a grid shows."""
-    size = np.diff(request.bounds, axis=0)[0]
+def are_separate(ends: Float, space: Space, bounds: Float) -> bool:
+    """Whether start and goal (2, 3) m are in different parts of the free space, as far as a grid shows."""
+    size = np.diff(bounds, axis=0)[0]
     # cells of 10 cm, larger if there would be more than 100,000
     nx, ny, nz = (size / max(0.1, np.cbrt(size.prod() / 100_000))).astype(int) + 1
-    grid = VoxelGrid.over(request.bounds, (nx, ny, nz))
-    free = request.space.is_free(grid.centers()).reshape(grid.shape)
+    grid = VoxelGrid.over(bounds, (nx, ny, nz))
+    free = space.is_free(grid.centers()).reshape(grid.shape)
     parts, _ = label(free, np.ones((3, 3, 3)))
-    start, goal = parts.ravel()[grid.location_ids(request.ends)]
+    start, goal = parts.ravel()[grid.location_ids(ends)]
     return bool(start and goal and start != goal)  # 0 is not free
 
 
-def _shorten(route: Float, request: PathRequest, seconds: float, rng: np.random.Generator) -> Float:
+def _shorten(route: Float, problem: PathProblem, seconds: float, rng: np.random.Generator) -> Float:
     """Shorten a free route (S, 3) m by `improve`."""
 
     def length_below(candidate: Float, limit: float) -> float | None:
         length = float(lengths_along(candidate)[-1])
         return length if length < limit - 1e-9 else None
 
-    return improve(route, length_below, float(lengths_along(route)[-1]), request, seconds, rng)
+    return improve(route, length_below, float(lengths_along(route)[-1]), problem, seconds, rng)
 
 
 def improve(
     route: Float,
     cost_below: Callable[[Float, float], float | None],
     cost: float,
-    request: PathRequest,
+    problem: PathProblem,
     seconds: float,
     rng: np.random.Generator,
 ) -> Float:
@@ -231,15 +221,15 @@ def improve(
         route: (S, 3) m, corners.
         cost_below: cost of a route if less than a limit, else None.
         cost: of the route.
-        request: space and bounds.
+        problem: space and bounds.
         seconds: time limit.
         rng: of the variations.
     """
     end = time.monotonic() + seconds
     while time.monotonic() < end:
-        candidate, first, last = propose_route_change(route, request.bounds, rng)
+        candidate, first, last = propose_route_change(route, problem.bounds, rng)
         # only the changed segments need to be tested
-        if not request.space.segments_are_free(candidate[first:last], candidate[first + 1 : last + 1]).all():
+        if not problem.space.segments_are_free(candidate[first:last], candidate[first + 1 : last + 1]).all():
             continue
         lower = cost_below(candidate, cost)
         if lower is not None:
@@ -273,14 +263,21 @@ def propose_route_change(route: Float, bounds: Float, rng: np.random.Generator) 
     return moved, row - 1, row + 1
 
 
-class _Problem:
-    """A planning problem over states x, y, z (m), yaw, pitch (radians); without a map the last two do not matter."""
+class PathProblem:
+    """A planning problem over states x, y, z (m), yaw, pitch (radians); without a map the last two do not matter.
 
-    def __init__(self, request: PathRequest, viewpoint_map: ViewpointMap | None) -> None:
-        self.request = request
-        self.config = request.config
+    `ends` (2, 3) m are start and goal, `bounds` (2, 3) m the corners of the space to plan in.
+    """
+
+    def __init__(
+        self, ends: Float, bounds: Float, space: Space, config: PathConfig, viewpoint_map: ViewpointMap | None = None
+    ) -> None:
+        self.ends = ends
+        self.bounds = bounds
+        self.space = space
+        self.config = config
         self.map = viewpoint_map
-        self.pitch = tuple(map(math.radians, request.config.pitch_deg))
+        self.pitch = tuple(map(math.radians, config.pitch_deg))
         if viewpoint_map is not None:
             self._score = viewpoint_map.scores.item
             self._table = _nearest_directions(viewpoint_map.directions)
@@ -333,7 +330,7 @@ class _Problem:
             # the sum of yaw and pitch is never less than the angle between the axes, so the limit holds
             if abs(_wrapped(b[3] - a[3])) + abs(b[4] - a[4]) > limit:
                 return False
-        return bool(self.request.space.segments_are_free([a[:3]], [b[:3]])[0])
+        return bool(self.space.segments_are_free([a[:3]], [b[:3]])[0])
 
     def solve(self, orientations: list[tuple[float, float]], time_s: float, max_s: float, bar: Any) -> Float:
         """Return the states (S, 5) of the best path found in `time_s`, or else of the first one found until `max_s`.
@@ -345,10 +342,10 @@ class _Problem:
         util.setLogLevel(util.LOG_NONE)
         # without a map nothing depends on where the camera looks: the pitch has next to no range, the yaw no weight
         pitch = self.pitch if self.map is not None else (-1e-6, 1e-6)
-        low, high = self.request.bounds
+        low, high = self.bounds
         space = _state_space(low, high, pitch, 0.2 if self.map is not None else 1e-6)
         information = base.SpaceInformation(space)
-        information.setStateValidityChecker(lambda state: bool(self.request.space.is_free([_numbers(state)[:3]])[0]))
+        information.setStateValidityChecker(lambda state: bool(self.space.is_free([_numbers(state)[:3]])[0]))
         possible = self.motion_is_possible
         cost_of = self.motion_cost
 
@@ -368,12 +365,12 @@ class _Problem:
         definition = base.ProblemDefinition(information)
         for yaw, start_pitch in orientations:
             state = space.allocState()
-            for index, number in enumerate((*self.request.ends[0], start_pitch)):
+            for index, number in enumerate((*self.ends[0], start_pitch)):
                 state[0][index] = float(number)
             state[1].value = float(yaw)
             definition.addStartState(state)
         goal_region = base.GoalSpace(information)
-        goal_region.setSpace(_state_space(self.request.ends[1] - 1e-9, self.request.ends[1] + 1e-9, pitch, 1.0))
+        goal_region.setSpace(_state_space(self.ends[1] - 1e-9, self.ends[1] + 1e-9, pitch, 1.0))
         definition.setGoal(goal_region)
         objective = Costs(information)
         definition.setOptimizationObjective(objective)
@@ -388,13 +385,13 @@ class _Problem:
             spent += step
             bar.update(min(step, max(0.0, bar.total - bar.n)))
         if not definition.hasExactSolution():
-            if are_separate(self.request):
+            if are_separate(self.ends, self.space, self.bounds):
                 problem = "start and goal seem to be in separate parts of the free space"
                 fix = (
                     "Give two positions of one part, or allow narrower passages: --scenes.free_space.clearance_m 0.15, "
                 )
                 fix += "without a mesh --scenes.mapped_space.max_camera_distance_m 1.5."
-                raise PlanningError(problem, value=self.request.ends.tolist(), fix=fix)
+                raise PlanningError(problem, value=self.ends.tolist(), fix=fix)
             fix = "Give it more time, such as --plan.planner.time_s 30, or loosen the camera's limits."
             raise PlanningError("no path was found in time", value=f"{spent:.2g} s", fix=fix)
         solution = definition.getSolutionPath()
@@ -424,8 +421,8 @@ def _state_space(low: Float, high: Float, pitch: tuple[float, ...], yaw_weight: 
     return space
 
 
-def _forward(positions: Float, pitch: Float) -> Float:
-    """Unit axes (W, 3) that look along a path (W, 3), as level as the limits of the pitch (2,) allow, in radians.
+def _forward(positions: Float, lowest: float, highest: float) -> Float:
+    """Unit axes (W, 3) that look along a path (W, 3), as level as limits of the pitch in radians allow.
 
     Where the path goes straight up or down, the yaw stays as before.
     """
@@ -436,7 +433,7 @@ def _forward(positions: Float, pitch: Float) -> Float:
     known = length > 1e-9
     last = np.maximum.accumulate(np.where(known, np.arange(len(steps)), int(np.argmax(known))))
     level = steps[last] / length[last, None]
-    least = float(np.clip(0.0, *pitch))
+    least = min(max(0.0, lowest), highest)
     return np.column_stack([level * math.cos(least), np.full(len(level), math.sin(least))])
 
 

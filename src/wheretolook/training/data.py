@@ -21,7 +21,7 @@ from wheretolook.dataset.viewpoint_table import UNLABELLED, is_good, poses
 from wheretolook.inputs.channels import ALL_CHANNELS, CHANNELS
 from wheretolook.inputs.statistics import FeatureStatistics
 from wheretolook.training.config import FittingConfig, SharedConfig
-from wheretolook.training.scenes import training_scenes
+from wheretolook.training.provenance import training_scenes
 from wheretolook.training.trained_network import TrainingRange, bin_quantities
 from wheretolook.utils.errors import ConfigError, TableError
 

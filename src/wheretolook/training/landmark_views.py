@@ -24,7 +24,7 @@ from wheretolook.training.config import SharedConfig
 from wheretolook.training.data import Batch, IndexBatches, TensorViews, ViewsDataModule, labelled_rows
 from wheretolook.training.fit import home_device
 from wheretolook.training.learner import TrainingJob
-from wheretolook.training.scenes import training_scenes
+from wheretolook.training.provenance import training_scenes
 from wheretolook.training.trained_network import TrainingRange, camera_quantities, view_quantities
 
 DISTANCES = [ATTRIBUTES.index(name) for name in OF_SIZE]

@@ -7,7 +7,9 @@ from pathlib import Path
 from typing import ClassVar, Literal
 
 from wheretolook.commands.options import Command
+from wheretolook.utils.devices import usable_device
 from wheretolook.utils.errors import ConfigError, check_range
+from wheretolook.utils.processes import cores
 
 METHODS = ("best", "max-visibility", "max-visibility-shipped")
 
@@ -89,16 +91,26 @@ class Benchmark(Command):
 
     def run(self) -> None:
         """Run the benchmark, or score files, and write the report to `out`."""
-        from wheretolook_paper.benchmark.files import read_errors, read_poses
+        from wheretolook_paper.benchmark.files import BenchmarkScene, read_errors, read_poses
         from wheretolook_paper.benchmark.report import NOTES, SUMMARY_CSV, VIEWS_CSV, Result, Scores, write_report
 
         if self.errors is not None and self.poses is not None:
             scores = Scores.of(read_poses(self.poses), read_errors(self.errors))
             results = [Result(self.errors.resolve().parent.name, self.errors.name, scores)]
         else:
-            from wheretolook_paper.benchmark.round import run_scenes
+            from wheretolook_paper.benchmark.round import RoundConfig, run_scenes
 
-            results = run_scenes(self)
+            config = RoundConfig(
+                self.weights,
+                self.directions,
+                self.lattice,
+                self.max_turn_deg,
+                localize=self.localizer == "sift",
+                workers=self.workers or cores(),
+                device=usable_device(self.device),
+            )
+            scenes = [BenchmarkScene.of(folder, self.mesh, self.waypoints) for folder in self.scenes]
+            results = run_scenes(scenes, tuple(dict.fromkeys(self.methods)), self.out, config)
         if not results:
             print("Nothing to score yet. docs/benchmark.md explains how the benchmark's own script continues.")
             return

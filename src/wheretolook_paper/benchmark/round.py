@@ -38,13 +38,11 @@ from wheretolook.scorers.registry import check_method
 from wheretolook.scorers.weights import resolve_weights
 from wheretolook.select.waypoints import Waypoints, read_waypoints
 from wheretolook.select.where_to_look import WhereToLook
-from wheretolook.utils.devices import usable_device
 from wheretolook.utils.errors import MapError, SceneError, StorageError, TableError
 from wheretolook.utils.files import ArtifactCache, atomic_folder, cache_key, fingerprint, read_image, write_bytes
 from wheretolook.utils.package import VERSION
-from wheretolook.utils.processes import WorkerPool, cores
+from wheretolook.utils.processes import WorkerPool
 from wheretolook_paper.benchmark.actloc_baseline import ACTLOC, ACTLOC_FIXED, MAX_ERROR_PX, actloc_views
-from wheretolook_paper.benchmark.command import Benchmark
 from wheretolook_paper.benchmark.files import (
     CAMERA,
     DRAWN_CAMERA,
@@ -369,23 +367,14 @@ def read_rgb(path: Path) -> NDArray[np.uint8] | None:
         return None
 
 
-def run_scenes(options: Benchmark) -> list[Result]:
-    """Run the benchmark in scene folders by every method, and print the messages."""
-    methods = dict.fromkeys(options.methods)
+def run_scenes(
+    scenes: Sequence[BenchmarkScene], methods: Sequence[str], out: Path, config: RoundConfig
+) -> list[Result]:
+    """Run the benchmark in scenes by every method, each scene in a folder of `out`, and print the messages."""
     for method in methods:
         if method not in (BEST, ACTLOC):
             check_method(method)
-    scenes = [BenchmarkScene.of(folder, options.mesh, options.waypoints) for folder in options.scenes]
-    config = RoundConfig(
-        options.weights,
-        options.directions,
-        options.lattice,
-        options.max_turn_deg,
-        localize=options.localizer == "sift",
-        workers=options.workers or cores(),
-        device=usable_device(options.device),
-    )
-    rounds = [SceneRound(scene, options.out / scene.name, config) for scene in scenes]
+    rounds = [SceneRound(scene, out / scene.name, config) for scene in scenes]
     results: list[Result] = []
     while rounds:
         one = rounds.pop(0)  # so that its mesh goes when it is done

@@ -6,19 +6,27 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, ClassVar
 
-from wheretolook.commands.options import LabelOptions, Log, Progress, SceneOptions, ignore_progress, load_dataset
+from wheretolook.commands.options import (
+    LabelOptions,
+    Log,
+    Progress,
+    SceneOptions,
+    extractor_of,
+    ignore_progress,
+    load_dataset,
+    open_scene,
+)
 from wheretolook.dataset.dataset_lock import reading
 from wheretolook.dataset.layout import Dataset, SceneFolder
-from wheretolook.tracking import TrackingConfig
+from wheretolook.scorers.registry import is_probability
+from wheretolook.tracking import TrackingConfig, check_store
 from wheretolook.utils.errors import ConfigError, SceneError
 from wheretolook_paper.paths.config import PathsConfig
 
 if TYPE_CHECKING:
     import pandas as pd
 
-
-FOLDER = "paths"
-"""In `results/`: a folder for each scene, and the views of all scenes."""
+    from wheretolook_paper.paths.scene_comparison import SceneComparison
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,12 +59,44 @@ class ComparePaths(SceneOptions, LabelOptions):
             SceneError: a scene has no mesh, or too little free space for starts and goals.
             TrackingError: the tracking store cannot be used.
         """
-        from wheretolook_paper.paths.scene_comparison import compare_scenes
+        from wheretolook_paper.paths.scene_comparison import compare_scenes, report_paths
 
-        with reading(self.root, "compare-paths", FOLDER):
-            summary = compare_scenes(self, load_dataset(self, "map"), log)
+        with reading(self.root, "compare-paths", "paths"):
+            dataset = load_dataset(self, "map")
+            compared = compare_scenes(self._comparisons(dataset, log), self.label)
+            summary = report_paths(compared, dataset, self.paths, self.tracking, log)
         progress(1)
         return summary
+
+    def _comparisons(self, dataset: Dataset, log: Log) -> list[SceneComparison]:
+        from wheretolook.localization.shard import SceneJob
+        from wheretolook.planning.scene_map import check_methods
+        from wheretolook.scorers.weights import resolve_weights
+        from wheretolook_paper.paths.scene_comparison import SceneComparison
+
+        config = self.paths
+        check_methods(config.methods)
+        if config.stops.looks > 1 and not any(map(is_probability, config.methods)):
+            raise ConfigError("stops need a method whose scores are probabilities", value=config.methods)
+        check_store(self.tracking)
+        scenes = scenes_with_meshes(dataset, config.in_scenes)
+        weights = {name: resolve_weights(name, config.weights, dataset=dataset, log=log) for name in config.methods}
+        comparisons = []
+        for files in scenes:
+            scene = open_scene(self, files)
+            extractor = extractor_of(files, self.extractor)
+            job = SceneJob(
+                files.mesh,
+                files.landmarks,
+                scene.camera,
+                self.label.localizer,
+                extractor,
+                scene.device,
+                appearance=self.label.appearance,
+            )
+            folder = dataset.root / "results" / "paths" / scene.name
+            comparisons.append(SceneComparison(scene, folder, config, weights, job, log))
+        return comparisons
 
 
 def scenes_with_meshes(dataset: Dataset, names: Sequence[str]) -> list[SceneFolder]:

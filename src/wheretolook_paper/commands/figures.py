@@ -84,11 +84,13 @@ class Figures(DatasetOptions):
         from wheretolook_paper.release.catalog import ITEMS, check_names, write_items
         from wheretolook_paper.release.copy import is_release
 
-        check_names(self.figures)
+        config = self.figures
+        check_names(config.only)
         if is_release(dataset):
             log_release(dataset, self.tracking, log, attach=False)
-        missing = write_items(dataset, self.tracking, self.figures, log)
-        wanted = self.figures.only or [item.name for item in ITEMS if item.paper]
+        out = config.out or dataset.root / "results" / "figures"
+        missing = write_items(dataset, self.tracking, out, config.only, config.kinds, log)
+        wanted = config.only or [item.name for item in ITEMS if item.paper]
         needed = {name: command for name, command in missing.items() if name in wanted}
         if needed:
             fix = "Run " + "; ".join(dict.fromkeys(needed.values()))

@@ -12,7 +12,6 @@ from wheretolook.dataset.dataset_lock import reads_dataset
 from wheretolook.tracking import TrackingConfig, check_store, ui_command
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.files import temporary_folder
-from wheretolook_paper.commands.figures import FiguresConfig
 
 if TYPE_CHECKING:
     from wheretolook.dataset.layout import Dataset
@@ -67,6 +66,5 @@ def log_release(dataset: Dataset, tracking: TrackingConfig, log: Log = print, at
     if runs.new and attach:
         log("attaching figures and tables")
         with temporary_folder() as folder:
-            config = FiguresConfig(Path(folder), QUICK, ("png",))
-            write_items(dataset, tracking, config, lambda text: None)
+            write_items(dataset, tracking, Path(folder), QUICK, say=lambda text: None)
     log(f"{runs.new} runs are new; all runs: {ui_command(tracking)}")

@@ -10,7 +10,7 @@ from wheretolook.commands.evaluate import Evaluate
 from wheretolook.commands.options import Experiment, Log, Progress, ignore_progress, load_dataset, select_options
 from wheretolook.dataset.config import RELEASE_FILE
 from wheretolook.dataset.dataset_lock import changing, reading, reads_dataset
-from wheretolook.evaluation.config import EvaluateConfig
+from wheretolook.evaluation.config import SCORES_CSV, VARIANTS_CSV, EvaluateConfig
 from wheretolook.tracking import check_store
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.files import check_folder_name, copy_file, safe_child, write_text
@@ -78,7 +78,6 @@ class Release(Experiment):
 
 def _finish(options: Release, dataset: Dataset, log: Log, progress: Progress) -> Dataset:
     """Choose the weights that ship with a release, evaluate them, and write its card."""
-    from wheretolook.evaluation.results import SCORES_CSV, VARIANTS_CSV
     from wheretolook_paper.release import copy as releases
     from wheretolook_paper.release.card import release_card
     from wheretolook_paper.release.training_histories import keep_histories

@@ -6,7 +6,15 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from wheretolook.commands.options import Log, Progress, SceneOptions, ignore_progress, load_dataset
+from wheretolook.commands.options import (
+    Log,
+    Progress,
+    SceneOptions,
+    extractor_of,
+    ignore_progress,
+    load_dataset,
+    open_scene,
+)
 from wheretolook.dataset.dataset_lock import reading
 from wheretolook.tracking import TrackingConfig, check_store
 from wheretolook.utils.errors import check_choice, check_range, no_option
@@ -14,6 +22,9 @@ from wheretolook_paper.commands.compare_paths import scenes_with_meshes
 
 if TYPE_CHECKING:
     import pandas as pd
+
+    from wheretolook.dataset.layout import Dataset, SceneFolder
+    from wheretolook_paper.relocalization import PolicyComparison, SimulatedRobot
 
 
 POLICIES = {
@@ -25,9 +36,6 @@ POLICIES = {
     "known": "highest score at the true pose (upper bound)",
 }
 """Rules for the next view."""
-
-FOLDER = "relocalize"
-"""In `results/`: a folder for each scene, and the poses of all scenes."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,11 +92,37 @@ class Relocalize(SceneOptions):
             ConfigError: no such scene, or no weights. WeightsError: the weights cannot be used.
             SceneError: a scene has no mesh. TrackingError: the tracking store cannot be used.
         """
-        from wheretolook_paper.evaluation.relocalization import compare_policies
-
-        with reading(self.root, "relocalize", FOLDER):
+        with reading(self.root, "relocalize", "relocalize"):
             dataset = load_dataset(self, "sample")
             check_store(self.tracking)
-            summary = compare_policies(self, dataset, scenes_with_meshes(dataset, self.in_scenes), log)
+            comparison = self._comparison(dataset, log)
+            table = comparison.simulate(scenes_with_meshes(dataset, self.in_scenes))
+            summary = comparison.report(table, self.tracking)
+            if self.film is not None:
+                comparison.film(table, self.film)
         progress(1)
         return summary
+
+    def _comparison(self, dataset: Dataset, log: Log) -> PolicyComparison:
+        from wheretolook.planning.scene_map import scene_scorer
+        from wheretolook.scorers.weights import resolve_weights
+        from wheretolook_paper.relocalization import PolicyComparison, SimulatedRobot
+
+        weights = resolve_weights(self.method, self.weights, dataset=dataset, log=log)
+
+        def robot_in(files: SceneFolder) -> SimulatedRobot:
+            scene = open_scene(self, files)
+            return SimulatedRobot(scene, scene_scorer(scene, self.method, weights), extractor_of(files, self.extractor))
+
+        return PolicyComparison(
+            dataset,
+            robot_in,
+            log,
+            weights,
+            places=self.places,
+            views=self.views,
+            confidence=self.confidence,
+            policies=self.policies,
+            method=self.method,
+            seed=self.seed,
+        )

@@ -14,8 +14,8 @@ from wheretolook.commands.options import open_scene
 from wheretolook.dataset.layout import Dataset, SceneFolder
 from wheretolook.dataset.viewpoint_files import has_matches, read_table
 from wheretolook.dataset.viewpoint_table import is_good, poses
-from wheretolook.evaluation.config import EvaluateConfig
-from wheretolook.evaluation.results import SCORES_MD, SCORES_PNG, VARIANTS_CSV, main_rows, read_scores, results_folder
+from wheretolook.evaluation.config import SCORES_MD, SCORES_PNG, VARIANTS_CSV, EvaluateConfig, results_folder
+from wheretolook.evaluation.results import main_rows, read_scores
 from wheretolook.figures.floor_plan import save_figure
 from wheretolook.geometry.poses import Float, camera_centers, poses_looking_along
 from wheretolook.geometry.views import Views

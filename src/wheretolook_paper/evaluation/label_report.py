@@ -187,8 +187,14 @@ def _table(frame: pd.DataFrame, columns: Mapping[str, str]) -> str:
 def _median_error(row: Mapping[str, Any], name: str) -> str:
     error_m = row[f"median_{name}_m"]
     error_deg = row[f"median_{name}_deg"]
-    unit, scale = ("mm", 1000) if error_m < 0.01 else ("cm", 100) if error_m < 1 else ("m", 1)
-    return f"{scale * error_m:.1f} {unit}, {error_deg:.{2 if error_deg < 1 else 0}f}°"
+    return f"{length_text(error_m)}, {error_deg:.{2 if error_deg < 1 else 0}f}°"
+
+
+def length_text(metres: float) -> str:
+    """Format a length in mm below 1 cm, in cm below 1 m, else in m."""
+    if metres < 0.01:
+        return f"{1000 * metres:.1f} mm"
+    return f"{100 * metres:.1f} cm" if metres < 1 else f"{metres:.1f} m"
 
 
 def _percent(share: float) -> str:

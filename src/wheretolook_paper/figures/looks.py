@@ -22,6 +22,7 @@ from wheretolook.localization.rig import Look, rig_of
 from wheretolook.localization.rig_localization import JointLocalization, JointLocalizer
 from wheretolook.utils.errors import PoseError
 from wheretolook.view.drawing import frustum_segments
+from wheretolook_paper.evaluation.label_report import length_text
 from wheretolook_paper.evaluation.looks import TOGETHER
 from wheretolook_paper.figures.animation import Pixels, pixels_of
 from wheretolook_paper.figures.dollhouse import Dollhouse, draw_house, draw_segments
@@ -123,10 +124,8 @@ class Estimate:
             return "no pose estimated"
         n_inliers = sum(map(len, self.pixels))
         if self.is_good:
-            return f"{n_inliers} inliers, correct, {100 * self.error_m:.1f} cm off"
-        off = f"{self.error_deg:.1f}°"
-        if self.error_m > MAX_ERROR_M:
-            off = f"{self.error_m:.1f} m" if self.error_m >= 1 else f"{100 * self.error_m:.0f} cm"
+            return f"{n_inliers} inliers, correct, {length_text(self.error_m)} off"
+        off = length_text(self.error_m) if self.error_m > MAX_ERROR_M else f"{self.error_deg:.1f}°"
         return f"{n_inliers} inliers, wrong, {off} off"
 
 

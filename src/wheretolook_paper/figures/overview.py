@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from wheretolook.dataset.viewpoint_table import LOCALIZED, UNLABELLED, is_good, poses
 from wheretolook.figures.floor_plan import BLUE, INK, RC, VERMILION, frame, new_figure
 from wheretolook.geometry.poses import Float, pan_tilt_angles
+from wheretolook_paper.evaluation.label_report import length_text
 from wheretolook_paper.figures.dollhouse import Dollhouse, draw_house
 from wheretolook_paper.figures.style import Style
 
@@ -52,8 +53,7 @@ def outcome_in_words(label: pd.Series, brief: bool = False) -> str:
         return status.replace("_", " ")
     error_m = float(label["error_m"])  # a row may hold it in single precision
     right = error_m < 1
-    error = f"{100 * error_m:.1f} cm, " if right else f"{error_m:.1f} m, "
-    error += f"{label['error_deg']:.2f}° off" if right else f"{label['error_deg']:.0f}° off"
+    error = f"{length_text(error_m)}, {label['error_deg']:.{2 if right else 0}f}° off"
     return error if brief else f"{'pose' if right else 'wrong pose'} found, {error}"
 
 

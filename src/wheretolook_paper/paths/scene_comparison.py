@@ -5,7 +5,7 @@ The views of a stop are localized jointly, and the last views of a path, linked 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property, partial
@@ -17,25 +17,22 @@ import pandas as pd
 from scipy.spatial.transform import Rotation
 from tqdm.auto import tqdm
 
-from wheretolook.commands.options import Log, extractor_of, open_scene
 from wheretolook.dataset.layout import Dataset
 from wheretolook.dataset.scene import Scene
 from wheretolook.dataset.viewpoint_files import SCHEMA
 from wheretolook.dataset.viewpoint_table import UNLABELLED, pose_columns, poses
 from wheretolook.figures.floor_plan import save_figure
 from wheretolook.geometry.poses import Float, camera_centers, invert_poses, poses_looking_along, rotation_angle_deg
+from wheretolook.localization.config import LabelConfig
 from wheretolook.localization.labeller import MANIFEST, LabelTask, label_scenes
 from wheretolook.localization.shard import SceneJob
 from wheretolook.planning.config import FORWARD
-from wheretolook.planning.scene_map import check_methods, planner_map, scene_scorer
+from wheretolook.planning.scene_map import planner_map, scene_scorer
 from wheretolook.planning.stops import stops_along, within_pitch
 from wheretolook.scorers.base import Scorer
 from wheretolook.scorers.registry import is_probability
-from wheretolook.scorers.weights import resolve_weights
-from wheretolook.tracking import TrackingConfig, check_store, kept_if_not_logged
-from wheretolook.utils.errors import ConfigError
+from wheretolook.tracking import TrackingConfig, kept_if_not_logged
 from wheretolook.utils.files import ArtifactCache, atomic_write, cache_key, fingerprint, read_json_object, write_text
-from wheretolook_paper.commands.compare_paths import FOLDER, ComparePaths, scenes_with_meshes
 from wheretolook_paper.evaluation.looks import label_sets
 from wheretolook_paper.figures.paths import paths_figure
 from wheretolook_paper.paths.config import PathsConfig
@@ -72,7 +69,6 @@ class SceneComparison:
     """
 
     scene: Scene
-    dataset: Dataset
     folder: Path
     config: PathsConfig
     weights: Mapping[str, Path | None]
@@ -328,50 +324,28 @@ def _replace_outcome(views: pd.DataFrame, rows: list[int], outcome: pd.DataFrame
         views.loc[rows, name] = outcome[name].astype(views[name].dtype).to_numpy()
 
 
-def compare_scenes(options: ComparePaths, dataset: Dataset, log: Log) -> pd.DataFrame:
-    """Plan, label and localize in all scenes; write and log the results. Returns the table of `summarize_paths`."""
-    config = options.paths
-    check_methods(config.methods)
-    if config.stops.looks > 1 and not any(map(is_probability, config.methods)):
-        raise ConfigError("stops need a method whose scores are probabilities", value=config.methods)
-    check_store(options.tracking)
-    scenes = _comparisons(options, dataset, log)
+def compare_scenes(scenes: Sequence[SceneComparison], label: LabelConfig) -> ComparedPaths:
+    """Plan, label and localize in all scenes; return their paths and views, with the column `scene`."""
     tasks = [task for scene in scenes for task in scene.tasks()]
-    with closing(label_scenes(tasks, options.label, description="localize")) as labelled:
+    with closing(label_scenes(tasks, label, description="localize")) as labelled:
         labels = {result.task.shards: result.table.reset_index(drop=True) for result in labelled}
     results = {one.scene.name: one.results(labels) for one in scenes}
     paths = pd.concat([found.paths.assign(scene=name) for name, found in results.items()], ignore_index=True)
     views = pd.concat([found.views.assign(scene=name) for name, found in results.items()], ignore_index=True)
-    return _report(paths, views, dataset, config, options.tracking, log)
+    return ComparedPaths(paths, views)
 
 
-def _comparisons(options: ComparePaths, dataset: Dataset, log: Log) -> list[SceneComparison]:
-    config = options.paths
-    scenes = scenes_with_meshes(dataset, config.in_scenes)
-    weights = {name: resolve_weights(name, config.weights, dataset=dataset, log=log) for name in config.methods}
-    comparisons = []
-    for files in scenes:
-        scene = open_scene(options, files)
-        extractor = extractor_of(files, options.extractor)
-        label = options.label
-        made_from = files.mesh, files.landmarks, scene.camera, label.localizer, extractor, scene.device
-        job = SceneJob(*made_from, appearance=label.appearance)
-        folder = dataset.root / "results" / FOLDER / scene.name
-        comparisons.append(SceneComparison(scene, dataset, folder, config, weights, job, log))
-    return comparisons
-
-
-def _report(
-    paths: pd.DataFrame, views: pd.DataFrame, dataset: Dataset, config: PathsConfig, tracking: TrackingConfig, log: Log
+def report_paths(
+    compared: ComparedPaths, dataset: Dataset, config: PathsConfig, tracking: TrackingConfig, log: Callable[[str], None]
 ) -> pd.DataFrame:
-    """Summarize the localized views, write tables and figure, and log them."""
-    summary = summarize_paths(paths, views, config)
+    """Write and log `<dataset>/results/paths.*` of paths with localized views. Returns the table of `summarize_paths`."""
+    summary = summarize_paths(compared.paths, compared.views, config)
     folder = dataset.root / "results"
     markdown = path_markdown(summary, config)
     write_text(folder / PATHS_CSV, summary.to_csv(index=False, float_format="%.6g", lineterminator="\n"))
     write_text(folder / PATHS_MD, markdown)
-    with atomic_write(folder / FOLDER / "views.parquet") as partial:
-        views.to_parquet(partial, index=False)
+    with atomic_write(folder / "paths" / "views.parquet") as partial:
+        compared.views.to_parquet(partial, index=False)
     save_figure(paths_figure(summary), folder / PATHS_PNG)
     params = {"dataset": dataset.name, "pairs": config.pairs, "seed": config.seed, "time_s": config.planner.time_s}
     params |= {"score_weight": config.planner.score_weight, "max_turn_deg": config.max_turn_deg}
@@ -383,5 +357,5 @@ def _report(
     with kept_if_not_logged(f"the comparison in {folder}"):
         log_paths(params, summary, folder, tracking)
     log(markdown)
-    log(f"-> {folder / PATHS_CSV}, {PATHS_MD}, {PATHS_PNG}; every view in {folder / FOLDER}")
+    log(f"-> {folder / PATHS_CSV}, {PATHS_MD}, {PATHS_PNG}; every view in {folder / 'paths'}")
     return summary

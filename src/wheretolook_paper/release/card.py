@@ -13,7 +13,8 @@ import yaml
 from wheretolook.dataset.config import ALL, THRESHOLDS, threshold_key, threshold_label
 from wheretolook.dataset.layout import Dataset
 from wheretolook.dataset.viewpoint_table import POSITIVE, label_shares, pooled_labels
-from wheretolook.evaluation.results import SCORES_CSV, VARIANTS_CSV, read_scores
+from wheretolook.evaluation.config import SCORES_CSV, VARIANTS_CSV
+from wheretolook.evaluation.results import read_scores
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.scorers.registry import learned
 from wheretolook.scorers.weights import resolve_weights

@@ -6,7 +6,7 @@ in the paper, its content and notebook, the run and file that it needs, and the 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -16,7 +16,8 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from wheretolook.dataset.layout import Dataset
-from wheretolook.evaluation.results import CALIBRATION_CSV, SCORES_CSV, read_scores
+from wheretolook.evaluation.config import CALIBRATION_CSV, SCORES_CSV
+from wheretolook.evaluation.results import read_scores
 from wheretolook.evaluation.statistics import read_calibration
 from wheretolook.figures.floor_plan import save_figure
 from wheretolook.scorers.weights import load_scorer
@@ -25,7 +26,6 @@ from wheretolook.training.provenance import HISTORY_CSV
 from wheretolook.utils.errors import ConfigError, MissingRunError, WhereToLookError
 from wheretolook.utils.files import write_text
 from wheretolook.utils.texts import markdown_table
-from wheretolook_paper.commands.figures import FiguresConfig
 from wheretolook_paper.evaluation.looks import LOOKS_CSV
 from wheretolook_paper.evaluation.score_report import comparisons_markdown, score_markdown
 from wheretolook_paper.figures.looks import looks_figure
@@ -345,31 +345,34 @@ def catalog_text() -> str:
     return markdown_table(["name", "paper", "shows", "notebook", "run"], rows)
 
 
-def check_names(config: FiguresConfig) -> None:
+def check_names(names: Collection[str]) -> None:
     """Raise ConfigError for unknown items."""
-    unknown = set(config.only) - {item.name for item in ITEMS}
+    unknown = set(names) - {item.name for item in ITEMS}
     if unknown:
         raise ConfigError("unknown figure", value=sorted(unknown), fix="`wheretolook figures --list` names them.")
 
 
 def write_items(
-    dataset: Dataset, tracking: TrackingConfig, config: FiguresConfig = FiguresConfig(),
+    dataset: Dataset,
+    tracking: TrackingConfig,
+    out: Path,
+    only: Collection[str] = (),
+    kinds: Sequence[str] = ("png",),
     say: Callable[[str], None] = print,
-) -> dict[str, str]:  # fmt: skip
-    """Write all items of a dataset, figures as several kinds of files, and attach them to their runs.
+) -> dict[str, str]:
+    """Write all items of a dataset to a folder, or those named in `only`, and attach them to their runs.
 
-    Files name the runs that they were drawn from: figures in their metadata, Markdown and TeX in a
-    comment. Returns, for each item that could not be made, the command to run first, or the
-    error. Raises as `check_names`.
+    Figures are written as several kinds of files. Files name the runs that they were drawn from: figures in their
+    metadata, Markdown and TeX in a comment. Returns, for each item that could not be made, the command to run first, or
+    the error. Raises as `check_names`.
     """
-    check_names(config)
-    out = config.out or dataset.root / "results" / "figures"
+    check_names(only)
     missing = {}
     for item in ITEMS:
-        if config.only and item.name not in config.only:
+        if only and item.name not in only:
             continue
         if item.of_release and not is_release(dataset):
-            if item.name in config.only:
+            if item.name in only:
                 missing[item.name] = "wheretolook figures --config configs/release.yaml"
             say(f"{item.name}: only releases have it")
             continue
@@ -383,7 +386,7 @@ def write_items(
             say(f"{item.name}: {'no such run; first: ' if isinstance(error, MissingRunError) else ''}{error}")
             continue
         ids = [run.info.run_id for run in runs]
-        files = _write(item.name, content, f"runs: {', '.join(ids)} ({item.stage})" if ids else "", out, config.kinds)
+        files = _write(item.name, content, f"runs: {', '.join(ids)} ({item.stage})" if ids else "", out, kinds)
         with kept_if_not_logged(f"{item.name} in {out}"):
             for run_id in ids:
                 for file in files:
@@ -392,7 +395,7 @@ def write_items(
     return missing
 
 
-def _write(name: str, content: Figure | Texts, note: str, out: Path, kinds: tuple[str, ...]) -> list[Path]:
+def _write(name: str, content: Figure | Texts, note: str, out: Path, kinds: Sequence[str]) -> list[Path]:
     if isinstance(content, Figure):
         files = [out / f"{name}.{kind}" for kind in kinds]
         for file in files:

@@ -18,7 +18,8 @@ import pandas as pd
 from wheretolook.dataset.config import ALL
 from wheretolook.dataset.layout import Dataset
 from wheretolook.dataset.viewpoint_table import UNLABELLED, is_good
-from wheretolook.evaluation.results import SCORES_CSV, best_of, evaluation_params, read_scores, runs_of_rows
+from wheretolook.evaluation.config import SCORES_CSV
+from wheretolook.evaluation.results import best_of, evaluation_params, read_scores, runs_of_rows
 from wheretolook.figures.floor_plan import save_figure
 from wheretolook.scorers.registry import learned
 from wheretolook.tracking import (

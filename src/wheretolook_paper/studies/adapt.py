@@ -16,12 +16,11 @@ import numpy as np
 import pandas as pd
 from jsonargparse import auto_cli
 
-from wheretolook.commands.adapt import labelled_views
 from wheretolook.dataset.config import Split
 from wheretolook.dataset.layout import Dataset
 from wheretolook.dataset.scene import Scene
 from wheretolook.dataset.viewpoint_table import CAMERA_ID, poses
-from wheretolook.evaluation.adaptation import compare_log_odds
+from wheretolook.evaluation.adaptation import compare_log_odds, labelled_views
 from wheretolook.scorers.adapted.calibration import calibrate
 from wheretolook.scorers.registry import make_scorer
 from wheretolook.utils.package import WEIGHTS, shipped

@@ -24,7 +24,7 @@ import pandas as pd
 from jsonargparse import auto_cli
 
 from wheretolook.dataset.config import ALL
-from wheretolook.evaluation.results import SCORES_CSV
+from wheretolook.evaluation.config import SCORES_CSV
 from wheretolook.utils.devices import usable_device
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.files import copy_file, read_json_object, sha256, write_json, write_text

@@ -36,8 +36,7 @@ from wheretolook.scorers.train_config import TrainConfig
 from wheretolook.tracking import TrackingConfig, start_run
 from wheretolook.training.fit import RunLog
 from wheretolook.training.learner import TrainingJob
-from wheretolook.training.provenance import weights_path
-from wheretolook.training.scenes import with_also
+from wheretolook.training.provenance import weights_path, with_also
 
 METHODS = ("mlp-2d+z", "mlp-2d+3d+landmark", "conv", "trees", "set", "sphere")
 

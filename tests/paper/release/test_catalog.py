@@ -14,7 +14,6 @@ from wheretolook.dataset.config import ALL
 from wheretolook.dataset.layout import Dataset
 from wheretolook.planning.config import PathConfig, PlanConfig
 from wheretolook.tracking import TrackingConfig, newest_artifact, newest_run
-from wheretolook_paper.commands.figures import FiguresConfig
 from wheretolook_paper.figures.scores import ROWS, top_n_figure, top_n_table
 from wheretolook_paper.release.catalog import ITEMS, write_items
 from wheretolook_paper.release.runs import log_release
@@ -45,7 +44,7 @@ def store(tmp_path_factory):
 def test_all_that_has_a_run_is_written_and_attached(store, tmp_path):
     release, tracking = store
     said = []
-    missing = write_items(release, tracking, FiguresConfig(tmp_path, kinds=("pdf",)), said.append)
+    missing = write_items(release, tracking, tmp_path, kinds=("pdf",), say=said.append)
     assert missing.keys() == NOT_THERE
     assert missing["training"] == "wheretolook train --config configs/release.yaml"
     assert any(missing["training"] in line for line in said)
@@ -69,7 +68,7 @@ def test_scenes_of_the_release_are_drawn_with_the_runs_of_their_weights(tmp_path
     tracking = TrackingConfig(str(tmp_path / "mlruns"))
     runs = log_release(release, tracking).ids
     drawn = tuple(OF_SCENES - {"planning"})
-    assert write_items(release, tracking, FiguresConfig(tmp_path / "out", drawn, ("png",)), quiet) == {}
+    assert write_items(release, tracking, tmp_path / "out", drawn, say=quiet) == {}
     notes = {name: Image.open(tmp_path / "out" / f"{name}.png").info.get("Description", "") for name in drawn}
     assert notes == {
         "pipeline": f"runs: {runs['train set']} (train)", "peaks": f"runs: {runs['train set']} (train)",

@@ -17,8 +17,7 @@ from wheretolook.scorers.set.network import MatchabilityNetwork, SetNetwork
 from wheretolook.training.data import Batch, IndexBatches, check_classes
 from wheretolook.training.landmark_views import DISTANCES, LandmarkBatches, LandmarkDataModule, random_log_scales
 from wheretolook.training.learner import TrainingJob, TrainingResult, train_network
-from wheretolook.training.provenance import weights_path
-from wheretolook.training.scenes import training_scenes
+from wheretolook.training.provenance import training_scenes, weights_path
 from wheretolook.training.trained_network import TrainedNetwork
 
 

@@ -3,7 +3,8 @@ probes of the field that its tables list among them."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal, get_args
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 from wheretolook.scorers.registry import BuildOptions, Method, imported
 
@@ -17,28 +18,21 @@ Approximation = Literal["exact", "quadratic", "gp"]
 METRICS = ("mineig", "logdet", "trace")
 
 
+def _built(scorer: str, *options: Any) -> Callable[[LocalizationMap, BuildOptions], Scorer]:
+    """Return a function that builds a scorer of `score.py` with these options."""
+    make = imported(f"wheretolook_paper.scorers.fisher.score:{scorer}")
+    return lambda localization_map, _: make(localization_map, *options)
+
+
 def _metric(metric: str, approximation: Approximation, about_origin: bool) -> Method:
-    def build(localization_map: LocalizationMap, options: BuildOptions) -> Scorer:
-        from wheretolook_paper.scorers.fisher.score import FisherScorer
-
-        return FisherScorer(localization_map, metric, approximation, about_origin)
-
     about = ", turned about the world's origin (only if named)" if about_origin else ""
     return Method(
         name=f"fisher-{metric}-{approximation}" + ("-origin" if about_origin else ""),
         about=f"A metric of the information that a view has on its own pose: {metric}, {approximation}{about}.",
-        build=build,
+        build=_built("FisherScorer", metric, approximation, about_origin),
         family="fisher",
         only_if_named=about_origin,
     )
-
-
-def _probe(name: str, scorer: str, about: str) -> Method:
-    def build(localization_map: LocalizationMap, options: BuildOptions) -> Scorer:
-        built: Scorer = imported(f"wheretolook_paper.scorers.fisher.score:{scorer}")(localization_map)
-        return built
-
-    return Method(f"fisher-{name}-trace", about, build)
 
 
 METHODS = (
@@ -49,14 +43,14 @@ METHODS = (
         for approximation in get_args(Approximation)
         if not about_origin or metric != "logdet"  # which is the same about any point
     ),
-    _probe(
-        "worst",
-        "WorstTraceScorer",
+    Method(
+        "fisher-worst-trace",
         'The view with the least trace by the quadratic field ("trace app worst"): what the field says not to do.',
+        _built("WorstTraceScorer"),
     ),
-    _probe(
-        "stationary",
-        "StationaryTraceScorer",
+    Method(
+        "fisher-stationary-trace",
         "The stationary point of the quadratic field's trace (\"trace app zero deriv\"), which is its minimum's side.",
+        _built("StationaryTraceScorer"),
     ),
 )

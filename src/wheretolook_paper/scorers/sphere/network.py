@@ -18,7 +18,7 @@ from wheretolook.training.config import FittingConfig
 from wheretolook.training.data import check_classes, validation_views
 from wheretolook.training.fit import home_device
 from wheretolook.training.learner import TrainingJob, TrainingResult, train_network
-from wheretolook.training.scenes import training_scenes
+from wheretolook.training.provenance import training_scenes
 from wheretolook.training.trained_network import StoredNetwork
 from wheretolook.utils.errors import WeightsError
 from wheretolook_paper.scorers.sphere import SphereConfig

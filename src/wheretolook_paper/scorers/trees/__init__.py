@@ -3,14 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
-from wheretolook.scorers.registry import BuildOptions, Learner, Method, imported
+from wheretolook.scorers.registry import Learner, Method, imported
 from wheretolook.utils.errors import check_positive, check_range, no_option
-
-if TYPE_CHECKING:
-    from wheretolook.inputs.localization_map import LocalizationMap
-    from wheretolook.scorers.base import Scorer
 
 
 @dataclass(frozen=True)
@@ -39,18 +34,11 @@ class TreesConfig:
         check_range("l2", self.l2, 0)
 
 
-def _build(localization_map: LocalizationMap, options: BuildOptions) -> Scorer:
-    from wheretolook_paper.scorers.trees.learn import BoostedTrees, TreesScorer
-
-    assert options.weights is not None
-    return TreesScorer(localization_map, BoostedTrees.load(options.weights))
-
-
 METHODS = (
     Method(
         name="trees",
         about="Probability that a view localizes, by boosted trees on positions and attributes of its visible landmarks.",
-        build=_build,
+        build=imported("wheretolook_paper.scorers.trees.learn:build_trees"),
         weights="trees",
         probability=True,
         learner=Learner(imported("wheretolook_paper.scorers.trees.learn:learn_trees"), TreesConfig),

@@ -24,11 +24,12 @@ from wheretolook.inputs.channels import ATTRIBUTES
 from wheretolook.inputs.landmark_features import LandmarkDescriber
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.scorers.base import BLOCK
+from wheretolook.scorers.registry import BuildOptions
 from wheretolook.scorers.set.score import LandmarkScorer
 from wheretolook.training.data import check_classes, labelled_rows, validation_views
 from wheretolook.training.fit import home_device
 from wheretolook.training.learner import TrainingJob, TrainingResult, class_counts, fit_platt
-from wheretolook.training.scenes import training_scenes
+from wheretolook.training.provenance import training_scenes
 from wheretolook.training.trained_network import TrainingRange, camera_quantities, view_quantities
 from wheretolook.training.weights import check_method_of_weights, read_weights, write_weights
 from wheretolook.utils.errors import ConfigError, WeightsError
@@ -207,3 +208,9 @@ class TreesScorer(LandmarkScorer):
             scores[begin : begin + BLOCK] = expit(self.trees.logits(pooled.cpu().numpy()))
         self._watch.check(self.name, self.training_range, quantities)
         return scores
+
+
+def build_trees(localization_map: LocalizationMap, options: BuildOptions) -> TreesScorer:
+    """Return the scorer of a weights file."""
+    assert options.weights is not None
+    return TreesScorer(localization_map, BoostedTrees.load(options.weights))

@@ -6,8 +6,8 @@ first view.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,6 @@ import pandas as pd
 from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
-from wheretolook.commands.options import Log, extractor_of, open_scene
 from wheretolook.dataset.layout import Dataset, SceneFolder
 from wheretolook.dataset.scene import Scene
 from wheretolook.dataset.viewpoint_table import LOCALIZED, is_good, poses
@@ -28,13 +27,10 @@ from wheretolook.localization.localizer import Localizer
 from wheretolook.localization.rig import Look, rig_of
 from wheretolook.localization.rig_localization import JointLocalization
 from wheretolook.looks.next_look import NextLookSelector, angles_to_views, mean_scores_by_pitch
-from wheretolook.planning.scene_map import scene_scorer
 from wheretolook.scorers.base import Scorer
-from wheretolook.scorers.weights import resolve_weights
-from wheretolook.tracking import BEST_TAG, NestedRun, kept_if_not_logged
+from wheretolook.tracking import BEST_TAG, NestedRun, TrackingConfig, kept_if_not_logged
 from wheretolook.utils.files import ArtifactCache, atomic_write, cache_key, fingerprint, write_text
 from wheretolook.utils.texts import markdown_table
-from wheretolook_paper.commands.relocalize import FOLDER, Relocalize
 from wheretolook_paper.evaluation.comparison import interval_text, log_comparison
 from wheretolook_paper.evaluation.looks import SET_COLUMNS, set_label
 from wheretolook_paper.figures.animation import save_moving
@@ -192,91 +188,112 @@ def summary_markdown(summary: pd.DataFrame, confidence: float) -> str:
     return f"{head}\n\n{markdown_table(heads, lines)}\n"
 
 
-def compare_policies(options: Relocalize, dataset: Dataset, scenes: Sequence[SceneFolder], log: Log) -> pd.DataFrame:
-    """Simulate in scenes; write and log `<dataset>/results/relocalize.*`, and a film if asked. Returns `summarize`."""
-    tables = [_simulated(options, dataset, files, log).assign(scene=files.name) for files in scenes]
-    table = pd.concat(tables, ignore_index=True)
-    summary = summarize(table, options.confidence)
-    results = dataset.root / "results"
-    markdown = summary_markdown(summary, options.confidence)
-    write_text(results / f"{FOLDER}.csv", summary.to_csv(index=False, float_format="%.6g", lineterminator="\n"))
-    write_text(results / f"{FOLDER}.md", markdown)
-    with atomic_write(results / FOLDER / "poses.parquet") as partial:
-        table.to_parquet(partial, index=False)
-    with kept_if_not_logged(f"the comparison in {results}"):
-        _log(options, dataset, summary, results)
-    log(markdown)
-    log(f"-> {results / FOLDER}.csv, {FOLDER}.md; every pose in {results / FOLDER}")
-    if options.film is not None:
-        _film(options, dataset, table, options.film, log)
-    return summary
+@dataclass(frozen=True)
+class PolicyComparison:
+    """A comparison of policies in scenes of a dataset, in `<dataset>/results/relocalize/`.
 
+    Attributes:
+        robot_in: opens a scene with the scorer of `method` and `weights`.
+        log: prints a line of progress.
+        places: locations in each scene, drawn from the sampled ones.
+        views: maximum number of views.
+        confidence: probability of the pose at which the camera stops.
+        policies: rules for the next view.
+        seed: of locations, first views and random views.
+    """
 
-def _robot(options: Relocalize, dataset: Dataset, files: SceneFolder, log: Log) -> SimulatedRobot:
-    scene = open_scene(options, files)
-    weights = resolve_weights(options.method, options.weights, dataset=dataset, log=log)
-    extractor = extractor_of(files, options.extractor)
-    return SimulatedRobot(scene, scene_scorer(scene, options.method, weights), extractor)
+    dataset: Dataset
+    robot_in: Callable[[SceneFolder], SimulatedRobot]
+    log: Callable[[str], None]
+    weights: Path | None
+    places: int
+    views: int
+    confidence: float
+    policies: Sequence[str]
+    method: str
+    seed: int
 
+    @property
+    def results(self) -> Path:
+        """Folder of the results."""
+        return self.dataset.root / "results"
 
-def _places(options: Relocalize, files: SceneFolder) -> dict[int, Float]:
-    """Return poses (D, 3, 4) of the sampled views at random locations, by the location's id."""
-    table = files.read_table()
-    of_view = table["location_id"].to_numpy(np.int64)
-    ids = np.random.default_rng(options.seed).permutation(np.unique(of_view))[: options.places]
-    cam_from_world = poses(table)
-    return {int(number): cam_from_world[of_view == number] for number in ids}
+    def simulate(self, scenes: Sequence[SceneFolder]) -> pd.DataFrame:
+        """Simulate in scenes, or read the cached results; return `SimulatedRobot.simulate` with the column `scene`."""
+        tables = [self._simulated(files).assign(scene=files.name) for files in scenes]
+        table = pd.concat(tables, ignore_index=True)
+        with atomic_write(self.results / "relocalize" / "poses.parquet") as partial:
+            table.to_parquet(partial, index=False)
+        return table
 
+    def report(self, table: pd.DataFrame, tracking: TrackingConfig) -> pd.DataFrame:
+        """Write and log `<dataset>/results/relocalize.*`. Returns `summarize`."""
+        summary = summarize(table, self.confidence)
+        markdown = summary_markdown(summary, self.confidence)
+        csv, page = files = [self.results / f"relocalize.{ending}" for ending in ("csv", "md")]
+        write_text(csv, summary.to_csv(index=False, float_format="%.6g", lineterminator="\n"))
+        write_text(page, markdown)
+        with kept_if_not_logged(f"the comparison in {self.results}"):
+            self._log_run(summary, files, tracking)
+        self.log(markdown)
+        self.log(f"-> {csv}, {page.name}; every pose in {self.results / 'relocalize'}")
+        return summary
 
-def _simulated(options: Relocalize, dataset: Dataset, files: SceneFolder, log: Log) -> pd.DataFrame:
-    """Simulate in a scene, or read the cached result."""
-    weights = resolve_weights(options.method, options.weights, dataset=dataset, log=log)
-    inputs = [fingerprint(path) for path in (files.mesh, files.landmarks, files.table, weights) if path is not None]
-    settings: list[Any] = [options.places, options.views, options.policies, options.method, options.seed]
-    cache = ArtifactCache(dataset.root / "results" / FOLDER / files.name, cache_key("1", [settings, inputs]), "poses")
-    stored = cache.load("poses.parquet")
-    if stored is not None:
-        return stored["poses.parquet"]
-    robot = _robot(options, dataset, files, log)
-    table = robot.simulate(_places(options, files), options.policies, options.views, options.seed, files.name)
-    return cache.store({"poses.parquet": table})["poses.parquet"]
+    def film(self, table: pd.DataFrame, path: Path) -> None:
+        """Film the place where the last policy succeeds with the lowest probability of the first view's pose."""
+        last = table[(table["policy"] == self.policies[-1]) & (table["hypothesis"] == 0)]
+        right = last[is_good(last) & (last["n_looks"] == self.views)].set_index(["scene", "location_id"]).index
+        first = last[last["n_looks"] == 1].set_index(["scene", "location_id"])
+        lost = first[first.index.isin(right) & ~is_good(first)]
+        if lost.empty:
+            self.log("no film: the last policy localizes no place where the first view fails")
+            return
+        scene, number = lost["n_inliers"].idxmax()
+        files = self.dataset.scene(str(scene))
+        robot = self.robot_in(files)
+        place = Place(robot, self._places(files)[int(number)])
+        start = int(np.random.default_rng([self.seed, int(number)]).integers(len(place.cam_from_world)))
+        rows = place.turn(self.policies[-1], start, self.views, np.random.default_rng([self.seed, int(number), 1]))
+        images = np.stack([place.image(row) for row in rows])
+        results = [place.localize(rows[:n]) for n in range(1, len(rows) + 1)]
+        story = story_of_steps(files.camera, place.cam_from_world[rows], images, results)
+        height = float(camera_centers(story.cam_from_world)[0, 2])
+        house = dollhouse(robot.scene.mesh, elevation_deg=62, cut_m=height + 0.3, width_px=700)
+        save_moving((frame for frame, _ in film_frames(story, house)), FRAME_MS, path, LAST_MS)
+        self.log(f"film of {scene}, location {number} -> {path}")
 
+    def _places(self, files: SceneFolder) -> dict[int, Float]:
+        """Return poses (D, 3, 4) of the sampled views at random locations, by the location's id."""
+        table = files.read_table()
+        of_view = table["location_id"].to_numpy(np.int64)
+        ids = np.random.default_rng(self.seed).permutation(np.unique(of_view))[: self.places]
+        cam_from_world = poses(table)
+        return {int(number): cam_from_world[of_view == number] for number in ids}
 
-def _log(options: Relocalize, dataset: Dataset, summary: pd.DataFrame, results: Path) -> None:
-    """Log the comparison as a run with its files, and a nested run for each policy."""
-    params = {"dataset": dataset.name, "places": options.places, "views": options.views, "method": options.method}
-    params |= {"confidence": options.confidence, "seed": options.seed}
-    rows = summary.set_index("policy").to_dict("index")
-    best = max(rows, key=lambda policy: float(rows[policy]["right"]) if policy != "known" else -1.0)
-    metrics = {str(name): float(value) for name, value in rows[best].items()}
-    nested = [
-        NestedRun(str(policy), {**params, "policy": policy}, {str(k): float(v) for k, v in row.items()})
-        for policy, row in rows.items()
-    ]
-    files = [results / f"{FOLDER}.csv", results / f"{FOLDER}.md"]
-    about = {BEST_TAG: str(best)}
-    log_comparison(options.tracking, "all policies", FOLDER, params, metrics, nested, files, about=about)
+    def _simulated(self, files: SceneFolder) -> pd.DataFrame:
+        """Simulate in a scene, or read the cached result."""
+        paths = (files.mesh, files.landmarks, files.table, self.weights)
+        inputs = [fingerprint(path) for path in paths if path is not None]
+        settings: list[Any] = [self.places, self.views, self.policies, self.method, self.seed]
+        key = cache_key("1", [settings, inputs])
+        cache = ArtifactCache(self.results / "relocalize" / files.name, key, "poses")
+        stored = cache.load("poses.parquet")
+        if stored is not None:
+            return stored["poses.parquet"]
+        robot = self.robot_in(files)
+        table = robot.simulate(self._places(files), self.policies, self.views, self.seed, files.name)
+        return cache.store({"poses.parquet": table})["poses.parquet"]
 
-
-def _film(options: Relocalize, dataset: Dataset, table: pd.DataFrame, path: Path, log: Log) -> None:
-    """Film the place where the last policy succeeds with the lowest probability of the first view's pose."""
-    last = table[(table["policy"] == options.policies[-1]) & (table["hypothesis"] == 0)]
-    right = last[is_good(last) & (last["n_looks"] == options.views)].set_index(["scene", "location_id"]).index
-    first = last[last["n_looks"] == 1].set_index(["scene", "location_id"])
-    lost = first[first.index.isin(right) & ~is_good(first)]
-    if lost.empty:
-        log("no film: the last policy localizes no place where the first view fails")
-        return
-    scene, number = lost["n_inliers"].idxmax()
-    files = dataset.scene(str(scene))
-    robot = _robot(options, dataset, files, log)
-    place = Place(robot, _places(options, files)[int(number)])
-    start = int(np.random.default_rng([options.seed, int(number)]).integers(len(place.cam_from_world)))
-    rows = place.turn(options.policies[-1], start, options.views, np.random.default_rng([options.seed, int(number), 1]))
-    images = np.stack([place.image(row) for row in rows])
-    results = [place.localize(rows[:n]) for n in range(1, len(rows) + 1)]
-    story = story_of_steps(files.camera, place.cam_from_world[rows], images, results)
-    height = float(camera_centers(story.cam_from_world)[0, 2])
-    house = dollhouse(robot.scene.mesh, elevation_deg=62, cut_m=height + 0.3, width_px=700)
-    save_moving((frame for frame, _ in film_frames(story, house)), FRAME_MS, path, LAST_MS)
-    log(f"film of {scene}, location {number} -> {path}")
+    def _log_run(self, summary: pd.DataFrame, files: Sequence[Path], tracking: TrackingConfig) -> None:
+        """Log the comparison as a run with its files, and a nested run for each policy."""
+        params = {"dataset": self.dataset.name, "places": self.places, "views": self.views, "method": self.method}
+        params |= {"confidence": self.confidence, "seed": self.seed}
+        rows = summary.set_index("policy").to_dict("index")
+        best = max(rows, key=lambda policy: float(rows[policy]["right"]) if policy != "known" else -1.0)
+        metrics = {str(name): float(value) for name, value in rows[best].items()}
+        nested = [
+            NestedRun(str(policy), {**params, "policy": policy}, {str(k): float(v) for k, v in row.items()})
+            for policy, row in rows.items()
+        ]
+        about = {BEST_TAG: str(best)}
+        log_comparison(tracking, "all policies", "relocalize", params, metrics, nested, files, about=about)

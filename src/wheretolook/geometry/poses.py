@@ -133,6 +133,11 @@ def as_numbers(values: ArrayLike) -> NDArray[np.float64]:
         raise PoseError(f"these are no numbers: {error}") from error
 
 
+def as_points(values: ArrayLike) -> Float:
+    """Return points as float64 (N, 3); one point (3,) is N = 1."""
+    return np.asarray(values, dtype=np.float64).reshape(-1, 3)
+
+
 def check_poses(cam_from_world: ArrayLike) -> NDArray[np.float64]:
     """The poses as float64 (B, 3, 4). Raises PoseError, a ValueError, on another shape or entries not finite or too large."""
     poses = as_numbers(cam_from_world)

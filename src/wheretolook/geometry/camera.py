@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from wheretolook.geometry.poses import Float
+from wheretolook.geometry.poses import Float, angle_deg, unit
 from wheretolook.utils.errors import ConfigError, MapError, TableError, check_choice
 from wheretolook.utils.files import read_text, write_text
 
@@ -135,7 +135,7 @@ class PinholeCamera(_Image):
         """Unit rays (..., 3) of pixels (..., 2) in the camera frame."""
         at = (np.asarray(pixels, dtype=np.float64) - (self.cx, self.cy)) / (self.fx, self.fy)
         rays = np.concatenate([at, np.ones_like(at[..., :1])], axis=-1)
-        return np.asarray(rays / np.linalg.norm(rays, axis=-1, keepdims=True))
+        return unit(rays)
 
 
 def _check_intrinsics(width: int, height: int, focal_px: tuple[float, ...]) -> None:
@@ -226,8 +226,7 @@ class ColmapCamera(_Image):
         with np.errstate(all="ignore"):
             pixels = np.asarray(self._camera.img_from_cam(flat))
             rows = np.flatnonzero(self.in_image(pixels))
-            length = np.linalg.norm(flat[rows], axis=1, keepdims=True)
-            miss = np.linalg.norm(flat[rows] / length - self.unproject(pixels[rows]), axis=1)
+            miss = np.linalg.norm(unit(flat[rows]) - self.unproject(pixels[rows]), axis=1)
         pixels[rows[~(miss <= 1e-4)]] = np.nan  # chord, about radians
         return pixels.reshape(*points.shape[:-1], 2)
 
@@ -236,7 +235,7 @@ class ColmapCamera(_Image):
         at = np.asarray(pixels, dtype=np.float64)
         rays = np.asarray(self._camera.cam_ray_from_img(at.reshape(-1, 2)))
         with np.errstate(invalid="ignore"):
-            rays = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+            rays = unit(rays)
         return rays.reshape(*at.shape[:-1], 3)
 
     def sees(self, points_cam: ArrayLike) -> NDArray[np.bool_]:
@@ -408,7 +407,7 @@ def field_of_view_deg(camera: Camera) -> tuple[float, float]:
     h = camera.height
     ends = np.array([[0, h / 2], [w, h / 2], [w / 2, 0], [w / 2, h]])
     middle = camera.unproject([w / 2, h / 2])
-    angles = np.degrees(np.arccos(np.clip(camera.unproject(ends) @ middle, -1, 1)))
+    angles = angle_deg(camera.unproject(ends) @ middle)
     return float(angles[0] + angles[1]), float(angles[2] + angles[3])
 
 

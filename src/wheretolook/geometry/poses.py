@@ -133,6 +133,16 @@ def as_numbers(values: ArrayLike) -> NDArray[np.float64]:
         raise PoseError(f"these are no numbers: {error}") from error
 
 
+def unit(vectors: Float) -> Float:
+    """Return vectors (..., 3) scaled to unit length."""
+    return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))
+
+
+def angle_deg(cosine: ArrayLike) -> Float:
+    """Return angles in degrees of cosines, which rounding may have moved beyond -1 or 1."""
+    return np.degrees(np.arccos(np.clip(cosine, -1, 1)))
+
+
 def as_points(values: ArrayLike) -> Float:
     """Return points as float64 (N, 3); one point (3,) is N = 1."""
     return np.asarray(values, dtype=np.float64).reshape(-1, 3)

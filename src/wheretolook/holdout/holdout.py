@@ -330,8 +330,7 @@ def _run(job: _BlockJob) -> int:
     rest = without(whole, image_ids[job.block.held_out].tolist())
     if rest.num_points3D() < MIN_LANDMARKS:
         return int(rest.num_points3D())
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", MapWarning)
+    with warnings.catch_warnings(action="ignore", category=MapWarning):
         landmarks = load_colmap_landmarks(job.model, job.source.features, None, job.device, rest, progress=False)
     observed = [
         _observed(whole.images[int(image_ids[row])], job.source, row, crop)

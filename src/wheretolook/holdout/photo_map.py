@@ -122,8 +122,7 @@ class PhotographedMap:
     @cached_property
     def map(self) -> Map:
         """The whole map, which scorers use."""
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", MapWarning)
+        with warnings.catch_warnings(action="ignore", category=MapWarning):
             landmarks = load_colmap_landmarks(self.path, self.features, reconstruction=self.model, arrays=self.arrays)
         return Map(
             landmarks,
@@ -203,8 +202,7 @@ def open_map(
     if to_frame.record() != IDENTITY.world_from_map.record():
         to_frame.transform_model(model)
         arrays = model_arrays(model)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", MapWarning)  # the error below replaces it
+    with warnings.catch_warnings(action="ignore", category=MapWarning):  # the error below replaces it
         if read_descriptors(features, model, arrays) is None:
             fix = "Give hloc's feats-*.h5, --database, or the folder of its photographs, --images, to extract features."
             raise MapError("there are no descriptors of a known kind", path=features, fix=fix)
@@ -272,8 +270,7 @@ def features_of(
     shutil.rmtree(out, ignore_errors=True)
     own = FrameOptions(scale=1, up="z")
     config = ImportConfig(images, model=model_dir, frame=own, extractor=extractor, keep_database=True)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", MapWarning)  # about the frame, which `open_map` corrects
+    with warnings.catch_warnings(action="ignore", category=MapWarning):  # about the frame, which `open_map` corrects
         map_existing(config, out, work / "photographs", workers=workers, device=device, reconstruction=model)
     cache.store()
     return out, out / DATABASE_FILE

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from tqdm.auto import tqdm
 
 from wheretolook.geometry.pose_files import NAME_COLUMNS, NamedRows, locations_of_rows, read_named_rows
-from wheretolook.geometry.poses import Float, camera_centers
+from wheretolook.geometry.poses import Float, angle_deg, camera_centers, unit
 from wheretolook.geometry.similarity import Similarity
 from wheretolook.mapping.colmap_model import ModelArrays
 from wheretolook.mapping.config import (
@@ -94,11 +94,12 @@ def place_marker(marker_id: int, views: Sequence[MarkerView]) -> Marker:
     images = tuple(view.image for view in views)
     start = np.stack([_meeting_point(views, corner) for corner in range(4)])
     centers = camera_centers(np.stack([view.cam_from_world for view in views]))
-    rays = start.mean(0) - centers
-    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    angle_deg = np.degrees(np.arccos(np.clip((rays @ rays.T).min(), -1, 1)))
-    if not angle_deg >= MIN_TRIANGULATION_ANGLE_DEG:
-        problem = f"marker {marker_id} is in photographs from one direction only, {angle_deg:.1f} degrees apart at most"
+    rays = unit(start.mean(0) - centers)
+    widest_deg = angle_deg((rays @ rays.T).min())
+    if not widest_deg >= MIN_TRIANGULATION_ANGLE_DEG:
+        problem = (
+            f"marker {marker_id} is in photographs from one direction only, {widest_deg:.1f} degrees apart at most"
+        )
         raise MapError(problem, value=" ".join(images), fix="Take another photograph of it from another place.")
 
     def residuals(values: Float) -> Float:

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
 from wheretolook.geometry.camera import Camera, ColmapCamera, PinholeCamera
-from wheretolook.geometry.poses import Float, split_poses
+from wheretolook.geometry.poses import Float, split_poses, unit
 from wheretolook.utils.devices import in_threads
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.processes import cores
@@ -111,8 +111,7 @@ def _rays_of_image(camera: ColmapCamera) -> tuple[Float, NDArray[np.bool_]]:
 def _border_between(camera: ColmapCamera, seen: Float, unseen: Float) -> Float:
     """Points (n, 3) on the border of the field of view between unit directions (n, 3) in and out of view."""
     for _ in range(20):  # of the gap between neighbouring centres: to 1e-8 rad
-        middle = seen + unseen
-        middle /= np.linalg.norm(middle, axis=1, keepdims=True)
+        middle = unit(seen + unseen)
         is_seen = camera.sees(middle)[:, None]
         seen = np.where(is_seen, middle, seen)
         unseen = np.where(is_seen, unseen, middle)
@@ -130,14 +129,17 @@ def octahedral_directions(u: ArrayLike, v: ArrayLike) -> Float:
     return np.stack([x, y, z], axis=-1)
 
 
+def cell_corners(size: int) -> Float:
+    """Unit directions (size + 1, size + 1, 3) of the corners of cells."""
+    edge = np.arange(size + 1) / size * 2 - 1
+    return unit(octahedral_directions(edge[None, :], edge[:, None]))
+
+
 def cell_centers(size: int) -> tuple[Float, Float]:
     """Unit directions (size^2, 3) of cells' centres, and the angle (size^2,) rad from each to its farthest corner."""
     middle = (np.arange(size) + 0.5) / size * 2 - 1
-    edge = np.arange(size + 1) / size * 2 - 1
-    centers = octahedral_directions(middle[None, :], middle[:, None])
-    corners = octahedral_directions(edge[None, :], edge[:, None])
-    centers /= np.linalg.norm(centers, axis=-1, keepdims=True)
-    corners /= np.linalg.norm(corners, axis=-1, keepdims=True)
+    centers = unit(octahedral_directions(middle[None, :], middle[:, None]))
+    corners = cell_corners(size)
     chords = [np.linalg.norm(centers - corners[i : i + size, j : j + size], axis=-1) for i in (0, 1) for j in (0, 1)]
     return np.asarray(centers.reshape(-1, 3)), 2 * np.arcsin(np.max(chords, axis=0) / 2).reshape(-1)
 

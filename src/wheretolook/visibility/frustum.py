@@ -122,11 +122,14 @@ def octahedral_directions(u: ArrayLike, v: ArrayLike) -> Float:
     """Directions (..., 3) with |x| + |y| + |z| = 1 of points (u, v) of the octahedral map, each in [-1, 1]."""
     u, v = np.broadcast_arrays(np.asarray(u, dtype=np.float64), np.asarray(v, dtype=np.float64))
     z = 1 - np.abs(u) - np.abs(v)
-    sign_u = np.where(u >= 0, 1.0, -1.0)
-    sign_v = np.where(v >= 0, 1.0, -1.0)
-    x = np.where(z >= 0, u, (1 - np.abs(v)) * sign_u)
-    y = np.where(z >= 0, v, (1 - np.abs(u)) * sign_v)
-    return np.stack([x, y, z], axis=-1)
+    return np.stack([*_folded(u, v, z), z], axis=-1)
+
+
+def _folded(a: Float, b: Float, z: Float) -> tuple[Float, Float]:
+    """Coordinates (...), those of the lower half of the octahedron (z < 0) folded over the edges; its own inverse."""
+    across_a = (1 - np.abs(b)) * np.where(a >= 0, 1.0, -1.0)
+    across_b = (1 - np.abs(a)) * np.where(b >= 0, 1.0, -1.0)
+    return np.where(z >= 0, a, across_a), np.where(z >= 0, b, across_b)
 
 
 def cell_corners(size: int) -> Float:
@@ -148,11 +151,7 @@ def cells_of(directions: ArrayLike, size: int) -> NDArray[np.int64]:
     """Cells (...) of directions (..., 3) of any length but zero: what `cell_of` in the kernels computes, in NumPy."""
     at = np.asarray(directions, dtype=np.float64)
     x, y, z = np.moveaxis(at / np.abs(at).sum(-1, keepdims=True), -1, 0)
-    sign_x = np.where(x >= 0, 1.0, -1.0)
-    sign_y = np.where(y >= 0, 1.0, -1.0)
-    u = np.where(z >= 0, x, (1 - np.abs(y)) * sign_x)
-    v = np.where(z >= 0, y, (1 - np.abs(x)) * sign_y)
-    column, row = (np.clip(((part + 1) / 2 * size).astype(np.int64), 0, size - 1) for part in (u, v))
+    column, row = (np.clip(((part + 1) / 2 * size).astype(np.int64), 0, size - 1) for part in _folded(x, y, z))
     return row * size + column
 
 

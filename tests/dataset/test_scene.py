@@ -59,7 +59,7 @@ def test_without_a_mesh_landmarks_hide_one_another_and_a_unit_is_needed(files):
 def test_an_occlusion_model_needs_its_files(occlusion, mesh, depth):
     with pytest.raises(ConfigError):
         files = ColmapFiles(Path("sparse"), mesh=mesh and Path(mesh), depth=depth and Path(depth))
-        Scene.of_colmap(files, occlusion=occlusion)
+        Scene.of_colmap(files, occlusion_name=occlusion)
 
 
 def test_the_most_accurate_occlusion_model_is_the_default(files):

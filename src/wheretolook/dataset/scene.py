@@ -92,7 +92,7 @@ class Scene:
         self,
         files: SceneFolder | ColmapFiles,
         camera: Camera | int | None = None,
-        occlusion: OcclusionConfig = OcclusionConfig(),
+        occlusion_config: OcclusionConfig = OcclusionConfig(),
         free_space: FreeSpaceConfig = FreeSpaceConfig(),
         mapped_space: MappedSpaceConfig = MappedSpaceConfig(),
         device: str = "cpu",
@@ -101,7 +101,7 @@ class Scene:
     ) -> None:
         self.files = files
         self.name = files.name
-        self.given_occlusion = occlusion
+        self.given_occlusion = occlusion_config
         self.free_space = free_space
         self.mapped_space_config = mapped_space
         self.progress = progress
@@ -115,7 +115,7 @@ class Scene:
         cls,
         files: ColmapFiles,
         camera: Camera | int | None = None,
-        occlusion: str | None = None,
+        occlusion_name: str | None = None,
         device: str = "cpu",
         cache_bytes: int = 0,
     ) -> Scene:
@@ -124,8 +124,8 @@ class Scene:
         Raises ConfigError if the occlusion model is unknown or its files are missing.
         """
         scene = cls(files, camera, device=device, cache_bytes=cache_bytes)
-        name = occlusion or scene.available_occlusion[0]
-        if occlusion is None and files.mesh is None and files.depth is None and (mesh := find_mesh(files.model)):
+        name = occlusion_name or scene.available_occlusion[0]
+        if occlusion_name is None and files.mesh is None and files.depth is None and (mesh := find_mesh(files.model)):
             LOG.info("mesh not used: %s; --mesh gives occlusion by it, if it is in the map's frame", mesh)
         scene.check_occlusion(name)
         scene.given_occlusion = OcclusionConfig(name)
@@ -267,8 +267,8 @@ class Scene:
     @cached_property
     def tsdf_volume(self) -> TsdfVolume:
         """The truncated signed distance field fused from the depth images."""
-        occlusion = self.given_occlusion
-        return TsdfVolume.from_images(self.depth_images, occlusion.voxel_m, occlusion.max_depth_m, self.progress)
+        config = self.given_occlusion
+        return TsdfVolume.from_images(self.depth_images, config.voxel_m, config.max_depth_m, self.progress)
 
     @property
     def sampled_space(self) -> FreeSpace | MappedSpace:

@@ -226,7 +226,7 @@ def _open_map(scene: SceneFolder, occlusion: OcclusionConfig | None, device: str
     # a release has no mesh, but stores visibility by it for each location
     if occlusion is None or not (scene.mesh.is_file() or occlusion.model != localization_map.occlusion.name):
         return localization_map
-    opened = Scene(scene, occlusion=occlusion, device=device, progress=progress)
+    opened = Scene(scene, occlusion_config=occlusion, device=device, progress=progress)
     return replace(localization_map, occlusion=opened.occlusion)
 
 

@@ -79,6 +79,21 @@ def test_eight_columns_that_two_orders_fit(tmp_path):
                 read(path)
 
 
+def test_four_columns_are_a_name_and_a_location_not_a_yaw(tmp_path):
+    path = tmp_path / "positions.txt"
+    for text in ("1.5 2 1 90\n0.5 2 1 45\n", "2 2 1 90\n2 3 1 45\n"):
+        path.write_text(text)
+        with pytest.raises(TableError, match="yaw"):
+            read_waypoints(path)
+        path.write_text("# x y z yaw_deg\n" + text)
+        assert_allclose(read_waypoints(path).heading_deg(np.eye(3)), [90, 45])
+    for first, second in (("7", "3"), ("0.25", "0.5"), ("a.jpg", "2")):  # numbers, times, names
+        path.write_text(f"{first} 1 2 3\n{second} 4 5 6\n")
+        waypoints = read_waypoints(path)
+        assert_allclose(waypoints.points, [(1, 2, 3), (4, 5, 6)])
+        assert waypoints.ids == (first, second)
+
+
 def test_binary_images_and_folders_of_models(tmp_path):
     images = b"".join(
         Struct("<I7dI").pack(row, *pose, 1) + name + b"\0" + Struct("<Q2dQ").pack(1, 3.0, 4.0, 5)

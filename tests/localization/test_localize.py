@@ -2,6 +2,7 @@
 
 import json
 import re
+from copy import copy
 
 import cv2
 import numpy as np
@@ -236,8 +237,32 @@ def test_an_assumed_focal_length_is_refined_with_the_pose(room, localizer, focal
     assert_near(result.cam_from_world, POSES[:1])
     row = result.table().iloc[0]
     assert row.camera_from == "assumed: camera 1 of the map" in result.describe()
+    assert row.features_from == result.features_from == localizer.extractor.method
     assert row.focal_px == pytest.approx(focal_px, rel=0.01)
     assert_near(localizer.localize(rgb, camera=camera).cam_from_world, POSES[:1])
+
+
+def test_the_name_of_a_mapping_image_is_not_enough_for_its_camera(localizer, photos, tmp_path):
+    """Another size, or an EXIF focal length of 277 px instead of 160 px; with the photographs, other pixels."""
+    name = next(iter(localizer.images.by_name))
+    exif = Image.Exif()
+    exif.get_ifd(0x8769).update({0x920A: 27.7, 0xA20E: 254.0})  # mm, and pixels an inch
+    photo = Image.open(photos / "a.png")
+
+    def camera_from(images, image, **options):
+        (tmp_path / "queries" / name).parent.mkdir(parents=True, exist_ok=True)
+        image.save(tmp_path / "queries" / name, **options)
+        return images.read(tmp_path / "queries" / name, name).camera_from
+
+    assert camera_from(localizer.images, photo) == f"mapping image {name}"
+    assert camera_from(localizer.images, photo.resize((160, 120))).startswith("assumed")
+    assert camera_from(localizer.images, photo, exif=exif, format="JPEG").startswith("assumed")
+    with_photographs = copy(localizer.images)
+    with_photographs.__dict__["_photographs"] = tmp_path / "images"
+    (tmp_path / "images" / name).parent.mkdir(parents=True)
+    photo.save(tmp_path / "images" / name)
+    assert camera_from(with_photographs, photo) == f"mapping image {name}"
+    assert camera_from(with_photographs, Image.open(photos / "b.png")).startswith("assumed")
 
 
 def test_a_portrait_image_has_the_camera_of_the_map_turned(localizer, photos):

@@ -1,10 +1,14 @@
 """Paths between walls: never through them, never beyond what the camera can do, and past what can be seen."""
 
+import os
+import subprocess
+import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from selection.room import write_room
 from wheretolook.geometry.lattices import VoxelGrid, axes_of_angles, fibonacci_sphere
 from wheretolook.geometry.poses import pan_tilt_angles, pan_tilt_turns_deg, rotation_angle_deg, rotation_looking_along
 from wheretolook.geometry.poses import turns_deg as turns_deg_of_cameras
@@ -175,3 +179,16 @@ def test_impossible_requests(change, error):
 def test_invalid_options(options):
     with pytest.raises(ConfigError):
         PathConfig(**options)
+
+
+@pytest.mark.slow
+def test_the_command_leaves_no_reports_of_leaks(tmp_path):
+    """The bindings of OMPL report objects that the exit of Python leaves."""
+    given = ["plan", "--map", str(write_room(tmp_path / "room")), "--method", "visible", "--device", "cpu"]
+    given += ["--start", "2,2,1.5", "--goal", "3.9,2.7,1.4", "--plan.planner.time_s", "0.1"]
+    given += ["--viewpoint_map.grid", "6,5,3", "--viewpoint_map.directions", "10"]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    run = [sys.executable, "-m", "wheretolook", *given]
+    done = subprocess.run(run, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "leak" not in done.stderr + done.stdout

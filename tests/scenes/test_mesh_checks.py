@@ -179,6 +179,22 @@ def test_normalized_integers_are_fractions_of_the_largest(whole, kind):
     np.testing.assert_array_equal(mesh.textures[0], expected.textures[0])
 
 
+@pytest.mark.parametrize("kind", [None, "uint16"])
+def test_texture_coordinates_are_transformed(whole, kind):
+    """Scaled, turned by a quarter from v to u, and moved (KHR_texture_transform)."""
+    u, v = load_mesh(whole).corner_uvs.reshape(-1, 2).T
+
+    def change(tree, buffer):
+        texture = tree["materials"][0]["pbrMetallicRoughness"]["baseColorTexture"]
+        turn = {"offset": [0.25, 0.5], "rotation": np.pi / 2, "scale": [0.5, 0.2]}
+        texture["extensions"] = {"KHR_texture_transform": turn}
+        return quantized(kind)(tree, buffer) if kind else tree
+
+    rewrite(whole, change)
+    found = load_mesh(whole).corner_uvs.reshape(-1, 2)
+    np.testing.assert_allclose(found, np.column_stack([0.25 + 0.2 * v, 0.5 - 0.5 * u]), atol=1e-5)
+
+
 def compressed(tree, _):
     """As Draco leaves a file: accessors without data, and the extension with that."""
     primitive = tree["meshes"][0]["primitives"][0]

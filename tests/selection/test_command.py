@@ -79,6 +79,8 @@ def test_images_of_several_cameras_are_scored_for_their_own(tmp_path, monkeypatc
     Path("far.txt").write_text("elsewhere.jpg 1 0 0 0 -2 -2 -1.5\n")
     assert main(["score", "--map", "two", "--scale", "1", "--poses", "far.txt", "--out", "s.csv", *given]) == 2
     assert "2 cameras" in capsys.readouterr().err
+    assert main(["score", "--map", "two", "--scale", "1", "--poses", "far.txt", "--out", "folder", *given]) == 2
+    assert "one camera" in capsys.readouterr().err  # before poses are scored
 
 
 def test_a_floor_plan(sparse, at, look):
@@ -111,7 +113,7 @@ def test_a_sequence_and_a_grid(sparse, at):
         "--map SPARSE --at gone.csv", "--map SPARSE --at 1,2,300", "--map SPARSE --at at.csv --format xml",
         "--map SPARSE --at at.csv --camera MAGIC,1,2", "--map SPARSE --at at.csv --fov 60 --camera-id 1",
         "--map SPARSE --at at.csv --fov 60 --size big", "--map SPARSE --at at.csv --nn 2",
-        "--map SPARSE --at 1 2 1.5",
+        "--map SPARSE --at 1 2 1.5", "--map SPARSE --at at.csv --mesh-up y",
     ],
 )  # fmt: skip
 def test_invalid_arguments_exit_with_two_and_one_line(arguments, sparse, at, capsys):

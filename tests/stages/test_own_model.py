@@ -163,6 +163,10 @@ def test_a_mesh_is_turned_and_must_overlap_with_the_map(tmp_path):
     for name in ("y.glb", "far.glb"):
         with pytest.raises(SceneError, match="overlap"):
             _ = Scene(replace(files, mesh=tmp_path / name)).mesh_space
+    imported = experiment_of(folder, tmp_path / "data", mesh=tmp_path / "far.glb")
+    with pytest.raises(SceneError, match="overlap"):
+        run(BuildMap, imported)
+    assert not (tmp_path / "data" / "mine" / "flat" / "map").exists()  # before the import
     turned = Scene(replace(files, mesh_up="y")).raycaster
     np.testing.assert_allclose(turned.distance_to_surface(point, 10.0), expected, atol=1e-5)
 

@@ -110,7 +110,7 @@ class Check(ScorerOptions, FrameOptions):
         name: dataset of the scene, if several have such a scene.
         database: features: COLMAP's database.db, or hloc's feats-*.h5.
         images: instead, photographs, to extract features again.
-        extractor: extractor for the images: opencv, colmap, aliked, disk or xfeat.
+        extractor: extractor for the images, as --mapping.extractor.method of `wheretolook map`.
         extractor_weights: weights of a learned extractor; see docs/features.md.
         out: folder of the results; by default data/checks/<name>.
         also: further methods to check, with the bundled weights.

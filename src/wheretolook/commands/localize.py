@@ -8,8 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
-from tqdm.auto import tqdm
-
 from wheretolook.commands.options import CameraOptions
 from wheretolook.dataset.config import checked_accuracy
 from wheretolook.features.extractor import ExtractorConfig
@@ -18,7 +16,7 @@ from wheretolook.geometry.camera import Camera
 from wheretolook.mapping.config import FrameOptions
 from wheretolook.mapping.photographs import SUFFIXES, find_photograph_files
 from wheretolook.utils.devices import usable_device
-from wheretolook.utils.errors import ConfigError, MapError, WhereToLookError, check_choice
+from wheretolook.utils.errors import ConfigError, MapError, check_choice
 
 if TYPE_CHECKING:
     from wheretolook.select.image_localizer import ImageLocalizer
@@ -69,7 +67,7 @@ class Localize(CameraOptions, FrameOptions):
         pitch: lowest and highest pitch in degrees of the next view.
         pan: its lowest and highest pan in degrees, to the left from the first view; by default any.
         database: COLMAP's database.db or hloc's feats-*.h5.
-        extractor: extractor for the images: opencv, colmap, aliked, disk or xfeat.
+        extractor: extractor for the images, as --mapping.extractor.method of `wheretolook map`.
         extractor_weights: weights of a learned extractor; see docs/features.md.
         pairs: hloc's file of the mapping images that retrieval found for each image, in lines "image mapping_image".
             Images are matched with the landmarks of these alone.
@@ -172,22 +170,11 @@ class Localize(CameraOptions, FrameOptions):
         return paths
 
     def _results(self, localizer: ImageLocalizer, paths: list[Path], names: list[str]) -> Iterable[Localized]:
-        """Yield the result of the rig, or of each image, with a progress bar."""
-        from wheretolook.localization.rig import PosePrior
-        from wheretolook.select.localized import FAILED, Localized
-
-        if self.prior is not None:
-            PosePrior.of(self.prior, localizer.frame.world_from_map)
+        """Return the result of the rig, or those of each image as they are ready."""
         camera = localizer.images.known_camera(self._query_camera())
         if self.turns is not None or len(paths) == 1:
-            yield localizer.localize(paths, self.turns, camera, self.prior, self.accuracy)
-            return
-        for path, name in zip(tqdm(paths, desc="localize", unit="image"), names, strict=True):
-            try:
-                result = localizer.localize(path, None, camera, self.prior, self.accuracy, [name])
-            except WhereToLookError as error:
-                result = Localized((name,), FAILED, str(error), frame=localizer.frame)
-            yield result
+            return [localizer.localize(paths, self.turns, camera, self.prior, self.accuracy)]
+        return localizer.localize_each(paths, names, camera, self.prior, self.accuracy)
 
     def _draw(self, result: Localized, localizer: ImageLocalizer) -> None:
         from wheretolook.figures.floor_plan import save_figure

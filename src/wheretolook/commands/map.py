@@ -39,7 +39,7 @@ from wheretolook.mapping.config import FrameOptions, ImportConfig, MapConfig, Ph
 from wheretolook.mapping.georeference import read_scale
 from wheretolook.mapping.imported_map import map_existing
 from wheretolook.mapping.map import choose_features, source_of_map
-from wheretolook.mapping.map_frame import read_frame, warn_of_mesh
+from wheretolook.mapping.map_frame import check_overlap, read_frame, warn_of_mesh
 from wheretolook.mapping.photograph_map import map_photographs
 from wheretolook.mapping.photographs import list_photographs
 from wheretolook.utils.errors import ConfigError, MapError, SceneError, reject
@@ -235,7 +235,7 @@ def _map_photographs(options: BuildMap, log: Log) -> SceneFolder:
     assert folder is not None
     scene = _new_scene(options, folder)
     _with_scene(scene, options.root)
-    tables = [path for path in (settings.scale.marker_table, settings.frame.positions) if path is not None]
+    tables = list(filter(None, (settings.scale.marker_table, settings.frame.positions)))
     for path in tables:
         if not path.is_file():
             raise ConfigError("there is no such table", path=path)
@@ -297,6 +297,8 @@ def _import_model(options: BuildMap, log: Log) -> tuple[SceneFolder, Dataset]:
     from wheretolook.scenes.loading import load_mesh, save_glb
 
     loaded = None if options.mesh is None else load_mesh(options.mesh, options.mesh_up, colored=False)
+    if options.mesh is not None and loaded is not None and model.num_points3D():
+        check_overlap(options.mesh, [point.xyz for point in model.points3D.values()], loaded.bounds)
     cache.clear()
     report = map_existing(
         settings,

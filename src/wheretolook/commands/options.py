@@ -126,6 +126,8 @@ OUTPUTS = ("out", "floor_plan", "figure", "record", "film")
 def _checking_outputs(run: Callable[..., T]) -> Callable[..., T]:
     @wraps(run)
     def checked(command: Any, *args: Any, **kwargs: Any) -> T:
+        if getattr(command, "mesh_up", "z") != "z" and command.mesh is None:
+            raise ConfigError("--mesh-up states the axis of a mesh", value=command.mesh_up, fix="Give --mesh.")
         options = list(_texts(command))
         inputs = [Path(text) for name, text in options if name not in OUTPUTS and os.path.exists(text)]
         for name, text in options:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
@@ -11,7 +11,6 @@ import numpy as np
 from wheretolook.commands.map import SceneOrMapOptions, imports_map
 from wheretolook.commands.options import Log, Progress, ignore_progress, load_dataset, open_scene
 from wheretolook.dataset.dataset_lock import reads_dataset
-from wheretolook.geometry.similarity import Similarity
 from wheretolook.planning.config import PlanConfig
 from wheretolook.planning.view_sequence import lengths_along
 from wheretolook.tracking import TrackingConfig, check_store, joined, kept_if_not_logged, start_run
@@ -23,8 +22,6 @@ from wheretolook.utils.processes import hold
 from wheretolook.utils.texts import score_text
 
 if TYPE_CHECKING:
-    import pandas as pd
-
     from wheretolook.geometry.views import Views
     from wheretolook.planning.routes import PlannedPath
 
@@ -66,7 +63,7 @@ class Plan(SceneOrMapOptions):
             SceneError, MapError: the scene has no free location, or no map with a scale.
             TrackingError: the tracking store cannot be used.
         """
-        from wheretolook.planning.scene_map import path_views, plan_by_methods
+        from wheretolook.planning.scene_map import path_table, path_views, plan_by_methods
 
         dataset = load_dataset(self, "map")
         config = self.plan
@@ -90,15 +87,12 @@ class Plan(SceneOrMapOptions):
         with hold(folder.with_name(f".{folder.name}.lock"), "plan", wait_s=120.0):
             written = []
             to_map = scene.frame.world_from_map.inverse
-            drawn = {
-                name: replace(along, cam_from_world=to_map.apply_to_poses(along.cam_from_world), frame=scene.frame)
-                for name, along in views.items()
-            }
+            drawn = {name: along.in_frame(scene.frame) for name, along in views.items()}
             for report in reports("plan"):
                 written += report(
                     drawn, to_map.apply(scene.landmarks.points), f"{scene.name}, {method}", folder, config.film
                 )
-            table = _table(path, to_map, stopping=config.stops.looks > 1)
+            table = path_table(path, to_map, stopping=config.stops.looks > 1)
             write_text(folder / "path.csv", table.to_csv(index=False, lineterminator="\n"))
             if config.rerun:
                 _record(views[method], scene.landmarks.points, folder / "path.rrd")
@@ -138,31 +132,6 @@ def _log(options: Plan, dataset: str, scene: str, methods: list[str], path: Plan
         log_to_run(client, run, metrics=metrics)
         for file in files:
             client.log_artifact(run, str(file))
-
-
-def _table(path: PlannedPath, map_from_world: Similarity, stopping: bool) -> pd.DataFrame:
-    """Return a row a view: position, axis, its score (NaN if the method scores nothing), pose cam_from_world.
-
-    All are in the map's own frame; where its unit is not the metre, positions are `x_units` instead of `x_m`. With
-    stops, further looks are rows of the same location; `look` counts from 1, the path's own view, and `together` is the
-    joint score of all looks of the stop (NaN elsewhere).
-    """
-    import pandas as pd
-
-    from wheretolook.dataset.viewpoint_table import pose_columns
-
-    views = path.views
-    at = map_from_world.apply(path.positions[views.waypoint])
-    along = path.all_axes @ map_from_world.rotation.T
-    unit = "m" if map_from_world.scale == 1 else "units"
-    names = (*(f"{axis}_{unit}" for axis in "xyz"), "axis_x", "axis_y", "axis_z")
-    columns = dict(zip(names, (*at.T, *along.T), strict=True))
-    poses = map_from_world.apply_to_poses(views.cam_from_world)
-    table = pd.DataFrame({**columns, "score": views.score, **pose_columns(poses)})
-    if stopping:
-        at_stop = np.bincount(views.waypoint)[views.waypoint] > 1
-        table = table.assign(look=views.rank, together=np.where(at_stop, views.set_score, np.nan))
-    return table
 
 
 def _record(views: Views, landmarks: np.ndarray, file: Path) -> None:

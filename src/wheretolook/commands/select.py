@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 import warnings
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
@@ -219,8 +219,7 @@ class Select(SelectionRequest, SelectorOptions):
         if waypoints is None:
             assert self.grid is not None
             waypoints = selector.grid(self.grid)
-        request = {field.name: getattr(self, field.name) for field in fields(SelectionRequest)}
-        views = selector.best(waypoints, progress=True, **request)
+        views = selector.select(waypoints, self, progress=True)
         finish(self, selector, views, len(waypoints), "waypoints")
         print(f"views: {len(views)} in {time.monotonic() - start:.1f} s: {self.out}")
         return views
@@ -270,6 +269,9 @@ class Score(SelectorOptions):
         poses_of_rows(table)  # an error about the file comes before the map is read
         named = self.named_camera()
         selector = self.open_map(camera="each" if named is None else named)
+        if selector.camera_of and check_format(self.out, self.format, 1) == "colmap" and not self.out.suffix:
+            fix = "Write csv or json, or give one camera: --camera-id or --camera."
+            raise ConfigError("a model of views has one camera, and the map has several", path=self.out, fix=fix)
         poses = Views.of_rows(table, selector.frame.world_from_map.rotation[2], self.frame)
         read_as = poses.read_as[0]
         if self.frame is None and read_as != table.format:

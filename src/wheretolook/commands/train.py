@@ -120,10 +120,7 @@ def _train(
     method: Method, dataset: Dataset, config: TrainConfig, about: Values, tracking: TrackingConfig, shared: Values
 ) -> TrainedModel:
     """Train a method, write its weights and record, and log it; `shared` are further fields of its task."""
-    from lightning.pytorch import seed_everything
-    from lightning.pytorch.utilities.seed import isolate_rng
-
-    from wheretolook.training.fit import RunLog
+    from wheretolook.training.fit import RunLog, seeded
     from wheretolook.training.learner import TrainingJob
 
     assert method.learner is not None
@@ -132,8 +129,8 @@ def _train(
     devices = {"devices": config.devices}
     record: Values = {}
     try:
-        with start_run(tracking, method.name, "train", params_of(about) | devices) as (client, run_id), isolate_rng():
-            seed_everything(config.seed, verbose=False)
+        params = params_of(about) | devices
+        with start_run(tracking, method.name, "train", params) as (client, run_id), seeded(config.seed):
             options = config.options_of(method)
             run_log = RunLog(tracking, run_id)
             result = method.learner.learn(

@@ -111,6 +111,11 @@ class ViewLattice:
         return direction_lattice(self.directions, self.lattice)
 
 
+def spread_rows(n: int, max_count: int) -> NDArray[np.int64]:
+    """Return at most so many evenly spread rows of n."""
+    return np.unique(np.linspace(0, n - 1, min(max_count, n)).round().astype(int))
+
+
 def fibonacci_sphere(n: int) -> Float:
     """Spherical Fibonacci lattice: n unit vectors (n, 3), from +z to -z, spread almost evenly (González 2010).
 

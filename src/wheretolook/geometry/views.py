@@ -194,6 +194,12 @@ class Views:
         """The same in the order xyzw."""
         return np.roll(self.quaternions_wxyz, -1, axis=1)
 
+    def in_frame(self, frame: Any) -> Views:
+        """Return views in the world in the own frame of a map, a `MapFrame`."""
+        return replace(
+            self, cam_from_world=frame.world_from_map.inverse.apply_to_poses(self.cam_from_world), frame=frame
+        )
+
     def save(self, path: str | Path, format: str | None = None) -> None:
         """Write selected views, with names, ranks, camera and frame, to a file, atomically; its folder is made if missing.
 

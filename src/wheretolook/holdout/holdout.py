@@ -21,6 +21,7 @@ from tqdm.auto import tqdm
 from wheretolook.dataset.config import Accuracy
 from wheretolook.dataset.viewpoint_table import LOCALIZED
 from wheretolook.features.extractor import Keypoints
+from wheretolook.geometry.lattices import spread_rows
 from wheretolook.geometry.poses import Float, camera_centers
 from wheretolook.holdout.photo_map import MAX_ERROR_DEG, MAX_ERROR_M, PhotographedMap
 from wheretolook.localization.config import LocalizerConfig, versions
@@ -95,7 +96,7 @@ def choose_blocks(source: PhotographedMap, views: int = VIEWS) -> list[Block]:
             chosen.append((held_out, is_part))
     _check_count(source, len(chosen))
     return [
-        Block(number, held_out, held_out[_spread(len(held_out), views)], is_part)
+        Block(number, held_out, held_out[spread_rows(len(held_out), views)], is_part)
         for number, (held_out, is_part) in enumerate(reversed(chosen), 1)
     ]
 
@@ -116,11 +117,6 @@ def _check_count(source: PhotographedMap, n_blocks: int, n_needed: int = 2) -> N
         problem = f"without a block of neighbouring photographs fewer than {MIN_LANDMARKS} landmarks are left"
         fix = "Take more photographs, each part of the scene from several sides, and map them all."
         raise MapError(problem, path=source.path, value=f"{len(source.poses)} photographs", fix=fix)
-
-
-def _spread(n: int, max_count: int) -> NDArray[np.int64]:
-    """Return at most so many evenly spread rows of n."""
-    return np.unique(np.linspace(0, n - 1, min(max_count, n)).round().astype(int))
 
 
 def _same(one: NDArray[np.int64], other: NDArray[np.int64]) -> bool:

@@ -104,21 +104,24 @@ def _median_direction(directions: Float) -> Float:
 LOOKING_DOWN = 0.7  # mean of the cameras' axes along -z above which their roll does not determine up
 
 
+def check_overlap(mesh: str | Path, points: ArrayLike, bounds: Float) -> None:
+    """Raise SceneError if the box of a mesh (2, 3) and that of most landmarks (N, 3), in its unit, do not overlap."""
+    box = np.quantile(np.asarray(points, dtype=np.float64), (0.01, 0.99), axis=0)
+    shared = np.minimum(box[1], bounds[1]) - np.maximum(box[0], bounds[0])
+    # a floor that both share does not count
+    if (shared < 0.1 * np.minimum(np.ptp(box, axis=0), np.ptp(bounds, axis=0))).any():
+        named = (("mesh", bounds), ("landmarks", box))
+        value = "; ".join(f"{what} {_rounded(low)} to {_rounded(high)}" for what, (low, high) in named)
+        fix = "Export both in the same frame and unit; --mesh-up y turns a mesh with y up (glTF's own)."
+        raise SceneError("the mesh and the map do not overlap", path=mesh, value=value, fix=fix)
+
+
 def warn_of_mesh(mesh: str | Path, points: ArrayLike, raycaster: MeshRaycaster) -> None:
     """Issue a `MapWarning` if a map's landmarks (N, 3) m seem not to be in the frame or unit of a mesh.
 
-    Raises SceneError if the box of the mesh and that of most landmarks do not overlap.
+    Raises SceneError as `check_overlap`.
     """
-    box = np.quantile(np.asarray(points, dtype=np.float64), (0.01, 0.99), axis=0)
-    shared = np.minimum(box[1], raycaster.bounds[1]) - np.maximum(box[0], raycaster.bounds[0])
-    # a floor that both share does not count
-    if (shared < 0.1 * np.minimum(np.ptp(box, axis=0), np.ptp(raycaster.bounds, axis=0))).any():
-        value = "; ".join(
-            f"{what} {_rounded(low)} to {_rounded(high)} m"
-            for what, (low, high) in (("mesh", raycaster.bounds), ("landmarks", box))
-        )
-        fix = "Export both in the same frame and unit; --mesh-up y turns a mesh with y up (glTF's own)."
-        raise SceneError("the mesh and the map do not overlap", path=mesh, value=value, fix=fix)
+    check_overlap(mesh, points, raycaster.bounds)
     if message := mesh_warning(points, raycaster):
         warnings.warn(f"{mesh}: {message}", MapWarning, stacklevel=2)
 

@@ -9,12 +9,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 from tqdm.auto import tqdm
 
 from wheretolook.dataset.config import Accuracy
 from wheretolook.dataset.layout import Dataset
 from wheretolook.dataset.scene import Scene
+from wheretolook.dataset.viewpoint_table import pose_columns
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.lattices import ViewLattice, VoxelGrid
 from wheretolook.geometry.poses import Float, poses_looking_along, rotation_looking_along, transform
@@ -297,3 +299,24 @@ def path_views(path: PlannedPath, localization_map: LocalizationMap, renderer: R
         pixels.append(camera.project(transform(pose, points[visible[row]])))
     images = None if renderer is None else renderer.render(camera, views.cam_from_world).rgb
     return replace(views, camera=camera, pixels=tuple(pixels), images=images)
+
+
+def path_table(path: PlannedPath, map_from_world: Similarity, stopping: bool) -> pd.DataFrame:
+    """Return a row a view: position, axis, its score (NaN if the method scores nothing), pose cam_from_world.
+
+    All are in the map's own frame; where its unit is not the metre, positions are `x_units` instead of `x_m`. With
+    stops, further looks are rows of the same location; `look` counts from 1, the path's own view, and `together` is the
+    joint score of all looks of the stop (NaN elsewhere).
+    """
+    views = path.views
+    at = map_from_world.apply(path.positions[views.waypoint])
+    along = path.all_axes @ map_from_world.rotation.T
+    unit = "m" if map_from_world.scale == 1 else "units"
+    names = (*(f"{axis}_{unit}" for axis in "xyz"), "axis_x", "axis_y", "axis_z")
+    columns = dict(zip(names, (*at.T, *along.T), strict=True))
+    poses = map_from_world.apply_to_poses(views.cam_from_world)
+    table = pd.DataFrame({**columns, "score": views.score, **pose_columns(poses)})
+    if stopping:
+        at_stop = np.bincount(views.waypoint)[views.waypoint] > 1
+        table = table.assign(look=views.rank, together=np.where(at_stop, views.set_score, np.nan))
+    return table

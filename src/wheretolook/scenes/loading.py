@@ -69,7 +69,7 @@ def load_mesh(path: str | PathLike[str], up: str = "z", colored: bool = True) ->
     file = _mesh_file(Path(path))
     _check_file(file)
     try:
-        corrected = {".glb": _with_float_positions, ".obj": _with_positive_indices}.get(file.suffix.lower())
+        corrected = {".glb": _with_all_applied, ".obj": _with_positive_indices}.get(file.suffix.lower())
         changed = corrected(file) if corrected else None
         source, kind = changed or (file.open("rb"), file.suffix[1:].lower())
         with source:
@@ -211,27 +211,46 @@ def _check_readable(tree: dict[str, Any], path: Path) -> None:
         raise SceneError(problem, path=path, value=", ".join(sorted(unread)), fix=fix)
 
 
-def _with_float_positions(path: Path) -> tuple[io.BytesIO, str] | None:
-    """The file as glTF with float numbers for normalized integers (glTF 2.0, 3.6.2.2), which trimesh ignores.
+def _with_all_applied(path: Path) -> tuple[io.BytesIO, str] | None:
+    """The file as glTF with what trimesh ignores applied: normalized integers, and transforms of textures; None without.
 
-    Colours stay integers, as trimesh expects. None if no number is normalized.
+    Normalized integers (glTF 2.0, 3.6.2.2) become float numbers, other than colours, which trimesh expects as integers.
+    Texture coordinates are transformed by the extension KHR_texture_transform of their material's colour.
     """
     tree, content = _read_glb(path)
-    attributes = [primitive["attributes"] for primitive in _primitives(tree)]
-    used = {at for of_part in attributes for name, at in of_part.items() if name[:5] != "COLOR"}
-    normalized = [tree["accessors"][at] for at in sorted(used) if tree["accessors"][at].get("normalized")]
-    if not normalized:
+    accessors = tree.get("accessors", [])
+    primitives = _primitives(tree)
+    used = {at for primitive in primitives for name, at in primitive["attributes"].items() if name[:5] != "COLOR"}
+    changed: list[tuple[dict[str, Any], dict[str, Any]]] = [
+        (accessors[at], {}) for at in sorted(used) if accessors[at].get("normalized")
+    ]
+    for primitive in primitives:
+        material = tree["materials"][primitive["material"]] if "material" in primitive else {}
+        texture = material.get("pbrMetallicRoughness", {}).get("baseColorTexture", {})
+        transform = texture.get("extensions", {}).get("KHR_texture_transform")
+        if transform:
+            chosen = transform.get("texCoord", texture.get("texCoord", 0))
+            changed.append(({**accessors[primitive["attributes"][f"TEXCOORD_{chosen}"]]}, transform))
+            primitive["attributes"]["TEXCOORD_0"] = len(accessors)
+            accessors.append(changed[-1][0])
+    if not changed:
         return None
     buffers = _buffers(tree, content, path)
     decoded = b""
-    for accessor in normalized:
+    for accessor, transform in changed:
         view = tree["bufferViews"][accessor["bufferView"]]
-        kind = np.dtype({5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2"}[accessor["componentType"]])
+        kind = np.dtype({5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}[accessor["componentType"]])
         shape = accessor["count"], {"VEC2": 2, "VEC3": 3, "VEC4": 4}[accessor["type"]]
         strides = view.get("byteStride", shape[1] * kind.itemsize), kind.itemsize
         start = view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
-        stored = np.ndarray(shape, kind, buffers[view["buffer"]], start, strides)
-        values = np.maximum(stored / np.float32(np.iinfo(kind).max), -1).astype("<f4").tobytes()
+        numbers = np.ndarray(shape, kind, buffers[view["buffer"]], start, strides)
+        if accessor.get("normalized"):
+            numbers = np.maximum(numbers / np.float32(np.iinfo(kind).max), -1)
+        if transform:
+            angle = transform.get("rotation", 0)
+            turn = np.array([(np.cos(angle), np.sin(angle)), (-np.sin(angle), np.cos(angle))])
+            numbers = numbers * transform.get("scale", (1, 1)) @ turn.T + transform.get("offset", (0, 0))
+        values = numbers.astype("<f4").tobytes()
         accessor |= {
             "bufferView": len(tree["bufferViews"]),
             "byteOffset": 0,

@@ -1,10 +1,10 @@
-"""Reads hloc's files of image pairs: the mapping images that retrieval found for each query."""
+"""Localizes images in a COLMAP model, among all of its landmarks or those of retrieved mapping images (hloc's pairs)."""
 
 from __future__ import annotations
 
 import warnings
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path, PurePath
@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import csr_array
+from tqdm.auto import tqdm
 
 from wheretolook.dataset.config import ACCURACY, CONTRADICTED, LOCALIZED, Accuracy, checked_accuracy
 from wheretolook.features.extractor import EXTRACTORS, KINDS, ExtractorConfig, Keypoints, kind_of, runnable_extractors
@@ -27,11 +28,19 @@ from wheretolook.mapping.config import FrameOptions
 from wheretolook.mapping.feature_files import HDF5_SUFFIXES, weights_in_name
 from wheretolook.mapping.georeference import REPORT_FILE
 from wheretolook.mapping.landmarks import Landmarks
-from wheretolook.mapping.map import Map, find_features, find_photographs, has_image
+from wheretolook.mapping.map import Map, find_features
 from wheretolook.mapping.map_frame import MapFrame
 from wheretolook.select.localized import Localized
 from wheretolook.select.query_images import KnownCamera, QueryImage, QueryImages, distinct_names
-from wheretolook.utils.errors import ConfigError, MapError, MapWarning, PoseError, TableError, from_record
+from wheretolook.utils.errors import (
+    ConfigError,
+    MapError,
+    MapWarning,
+    PoseError,
+    TableError,
+    WhereToLookError,
+    from_record,
+)
 from wheretolook.utils.files import path_ends, read_json_object, read_text
 
 
@@ -124,36 +133,43 @@ class ImageLocalizer:
         extractor = extractor or _extractor_of(path, landmarks)
         of_images = None if pairs is None else ImagePairs.read(pairs, opened.images)
         result = cls(landmarks, opened.frame, QueryImages(opened), extractor, device, of_images, lightglue, features)
-        _ = result._localizer.extractor  # so that another extractor and missing weights are reported once
-        if learned:
-            result._check_weights(opened)
+        _ = (
+            result._localizer.extractor,
+            result.features_from,
+        )  # so that other features and missing weights are reported once
         return result
 
-    def _check_weights(self, opened: Map) -> None:
-        """Compare the extractor with the map's learned descriptors: in two photographs, otherwise by the files' names.
+    @cached_property
+    def features_from(self) -> str:
+        """The extractor of images, and how it is known to be the map's; "assumed: ..." if the weights are not known.
 
-        A `MapWarning` names weights that are assumed. Raises MapError for others than the map's.
+        Learned descriptors are compared in two photographs, otherwise by the files' names. A `MapWarning` names weights
+        that are assumed. Raises MapError for others than the map's.
         """
-        images = opened.images
-        assert images is not None
-        folder = find_photographs(self.images.folder)
+        weights = self.extractor.weights or EXTRACTORS[self.extractor.method].weights
+        used = weights_in_name(weights)
+        extractor = f"{self.extractor.method} {used or Path(weights).stem}".strip()
+        if self._localizer.kind.in_bytes:
+            return extractor
+        images = self.images.mapping
         photographs: list[Any] = []
         for row in np.argsort(-np.bincount(images.observation_image, minlength=len(images.image_ids)), kind="stable"):
             name = images.image_names[row]
-            if folder is not None and len(photographs) < 2 and has_image(folder, name):
-                image = self.images.read(folder / name, name, opened.cameras[int(images.image_cameras[row])])
+            path = self.images.photograph(name) if len(photographs) < 2 else None
+            if path is not None:
+                image = self.images.read(path, name, self.images.cameras[int(images.image_cameras[row])])
                 photographs.append((int(row), image.rgb, image.camera))
         if self._localizer.check_weights(images, photographs):
-            return
-        weights = self.extractor.weights or EXTRACTORS[self.extractor.method].weights
-        used = weights_in_name(weights)
+            return f"{extractor}, compared in photographs"
         of_map = "" if self.features is None else weights_in_name(self.features)
         if used and of_map and used != of_map:
             fix = f"Give --extractor {self.extractor.method} --extractor-weights {of_map}.pth."
             raise MapError(f"the map has features of {of_map}", path=self.features, value=weights, fix=fix)
-        if used != of_map and self.features is not None and self.features.suffix in HDF5_SUFFIXES:
-            text = f"{self.features}: features of {of_map or self.landmarks.features} are assumed to be by {weights}"
-            warnings.warn(text, MapWarning, stacklevel=3)
+        if used == of_map or self.features is None or self.features.suffix not in HDF5_SUFFIXES:
+            return f"{extractor}, by the features' name"
+        text = f"{self.features}: features of {of_map or self.landmarks.features} are assumed to be by {weights}"
+        warnings.warn(text, MapWarning, stacklevel=3)
+        return f"assumed: {extractor}"
 
     @cached_property
     def _localizer(self) -> Localizer:
@@ -220,6 +236,27 @@ class ImageLocalizer:
             results += [self._localize(paths, [reading], cam_from_rig, near, limits) for reading in readings]
         return max(results, key=lambda result: (result.status in (LOCALIZED, CONTRADICTED), result.n_inliers))
 
+    def localize_each(
+        self,
+        paths: Sequence[Path],
+        names: Sequence[str],
+        camera: KnownCamera | int | str | Path | None = None,
+        prior: Sequence[float] | None = None,
+        accuracy: Accuracy = ACCURACY,
+    ) -> Iterator[Localized]:
+        """Yield the result of `localize` for each image, with a progress bar; the status "error" where that raises.
+
+        Raises ConfigError if the prior is invalid.
+        """
+        if prior is not None:
+            PosePrior.of(prior, self.frame.world_from_map)
+        for path, name in zip(tqdm(paths, desc="localize", unit="image"), names, strict=True):
+            try:
+                result = self.localize(path, None, camera, prior, accuracy, [name])
+            except WhereToLookError as error:
+                result = Localized((name,), "error", str(error), frame=self.frame)
+            yield result
+
     def _localize(
         self,
         paths: Sequence[str],
@@ -248,7 +285,7 @@ class ImageLocalizer:
         for n, look in enumerate(of_prior):
             poses[n] += rig.single_view_poses(look.scaled(ratio), 1)
         joint = rig.localize([first for first, *_ in views], poses)
-        return Localized.of(queries, joint, joint.probabilities(limits), self.frame)
+        return Localized.of(queries, joint, joint.probabilities(limits), self.frame, self.features_from)
 
     def _extract(self, query: QueryImage) -> Keypoints:
         """Extract the keypoints of an image, or of it turned upright, at the pixels of the image."""

@@ -24,9 +24,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-FAILED = "error"  # status of an image that cannot be read, or whose camera is unknown
-
-
 @dataclass(frozen=True, eq=False)
 class Localized:
     """The pose of one image, or of N images of a rig, in the map's own frame and unit, and the rival poses.
@@ -46,6 +43,7 @@ class Localized:
         frame: the map's own frame.
         cameras: of the images, as keypoints were extracted; an assumed focal length is refined with the pose.
         cameras_from: which camera each is and why, see `QueryImage.camera_from`; "assumed: ..." if it is not known.
+        features_from: the extractor of their keypoints, see `ImageLocalizer.features_from`; "assumed: ..." as well.
         images: the images themselves.
         joint: the result in the world: metres, z up.
     """
@@ -62,12 +60,18 @@ class Localized:
     frame: MapFrame = field(default=IDENTITY, repr=False)
     cameras: tuple[Camera, ...] = field(default=(), repr=False)
     cameras_from: tuple[str, ...] = field(default=(), repr=False)
+    features_from: str = field(default="", repr=False)
     images: tuple[QueryImage, ...] = field(default=(), repr=False)
     joint: JointLocalization | None = field(default=None, repr=False)
 
     @classmethod
     def of(
-        cls, images: Sequence[QueryImage], joint: JointLocalization, probabilities: Float, frame: MapFrame
+        cls,
+        images: Sequence[QueryImage],
+        joint: JointLocalization,
+        probabilities: Float,
+        frame: MapFrame,
+        features_from: str = "",
     ) -> Localized:
         """Convert a joint localization and the probabilities (1 + rivals,) of its poses to the map's own frame."""
         names = tuple(image.name for image in images)
@@ -75,6 +79,7 @@ class Localized:
         values: dict[str, Any] = {"names": names, "frame": frame, "images": tuple(images), "joint": joint}
         values["cameras"] = tuple(look.camera for look in joint.looks)
         values["cameras_from"] = tuple(image.camera_from for image in images)
+        values["features_from"] = features_from
         values |= {"n_matches": joint.n_matches, "n_inliers": joint.n_inliers}
         contradiction = ""
         if joint.turn_error_deg:
@@ -85,7 +90,8 @@ class Localized:
             return cls(status=joint.status, reason="; ".join(filter(None, (reason, contradiction))), **values)
         assert joint.cams_from_world is not None
         rivals = [
-            cls.of(images, rival, p, frame) for rival, p in zip(joint.rivals, probabilities[1:, None], strict=True)
+            cls.of(images, rival, p, frame, features_from)
+            for rival, p in zip(joint.rivals, probabilities[1:, None], strict=True)
         ]
         rivals = [rival for rival in rivals if rival.status == LOCALIZED]
         return cls(
@@ -153,6 +159,7 @@ class Localized:
                 "rival_probability": rival,
                 "reason": self.reason,
                 "camera_from": self.cameras_from or "",
+                "features_from": self.features_from,
                 "focal_px": [camera.colmap.mean_focal_px for camera in self.cameras] or np.nan,
                 **self.frame.angle_columns,
             }

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import filecmp
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +24,7 @@ from wheretolook.geometry.camera import (
 )
 from wheretolook.localization.rig import FocalPrior
 from wheretolook.mapping.colmap_model import find_camera
-from wheretolook.mapping.map import Map, reads_upright
+from wheretolook.mapping.map import Map, find_photographs, has_image, reads_upright
 from wheretolook.mapping.photographs import exif_focal_px, quarters_upright, read_photograph, reduce_photograph
 from wheretolook.utils.errors import ConfigError, PoseError
 from wheretolook.utils.files import path_ends
@@ -62,14 +64,15 @@ class QueryImages:
     Pixels are those as stored, as COLMAP and hloc read them, or upright by EXIF if the map's are; if only the other
     reading has the proportions of the camera, it is taken.
 
-    The camera of an image is the given or listed one, or that of the mapping image of the same name. Otherwise it is
-    assumed to be one of the map of the same proportions, also if it was turned by a quarter, or without any a pinhole of
+    The camera of an image is the given or listed one, or that of the mapping image of the same name, if it is that image.
+    Otherwise it is assumed to be one of the map of the same proportions, also if it was turned by a quarter, or without any a pinhole of
     the EXIF focal length.
     """
 
     def __init__(self, opened: Map) -> None:
         assert opened.path is not None and opened.images is not None
         self.folder = opened.path
+        self.mapping = opened.images
         self.cameras = opened.cameras
         ids = opened.images.image_cameras.tolist()
         self.by_name = {name: self.cameras[i] for name, i in zip(opened.images.image_names, ids, strict=True)}
@@ -105,8 +108,13 @@ class QueryImages:
             readings = [read_photograph(Path(image), self.upright)]
             if quarters_upright(Path(image)):
                 readings.append(read_photograph(Path(image), not self.upright))
-        by_name = known is not None and known_from.startswith("mapping image")
-        if known is not None and by_name and not any(_has_proportions(known, rgb) for rgb in readings):
+        of_map = known_from.partition("mapping image ")[2]
+        if (
+            path is not None
+            and known is not None
+            and of_map
+            and not self._is_mapping_image(path, readings, of_map, known)
+        ):
             known = None  # another image of this name
         candidates = [*self.cameras.values()] if known is None else [known]
         fitting = [rgb for rgb in readings if any(_has_proportions(one, rgb) for one in candidates)]
@@ -118,6 +126,31 @@ class QueryImages:
             problem = f"the image of {_size(rgb)} has other proportions than the camera"
             raise ConfigError(problem, path=path, value=describe_camera(known), fix="Correct --camera.")
         return replace(self._assumed(path, name, rgb), quarters=quarters)
+
+    def photograph(self, name: str) -> Path | None:
+        """Return the file of a mapping image; None if it is not found."""
+        folder = self._photographs
+        return folder / name if folder is not None and has_image(folder, name) else None
+
+    @cached_property
+    def _photographs(self) -> Path | None:
+        return find_photographs(self.folder)
+
+    def _is_mapping_image(self, path: Path, readings: Sequence[NDArray[np.uint8]], name: str, camera: Camera) -> bool:
+        """Test whether a file is the mapping image of this name, not another zoom, size or place.
+
+        It is the same file, or has its size and EXIF focal length. Where the photographs are not found, it must have the
+        proportions and at least the size of the camera, and no EXIF focal length that contradicts it.
+        """
+        in_exif = exif_focal_px(path)
+        original = self.photograph(name)
+        if original is not None:
+            same_focal = in_exif is not None and in_exif == exif_focal_px(original)  # in pixels of its size
+            return same_focal or filecmp.cmp(path, original, shallow=False)
+        longer = max(readings[0].shape)
+        fits = longer >= max(camera.width, camera.height) and any(_has_proportions(camera, rgb) for rgb in readings)
+        expected = camera.colmap.mean_focal_px * longer / max(camera.width, camera.height)
+        return fits and (in_exif is None or bool(abs(np.log(in_exif / expected)) < 0.05))  # as in `_assumed`
 
     def _known(self, path: Path | None, name: str, given: KnownCamera | None) -> tuple[Camera | None, str]:
         """Return the camera that was given or listed, or that of the mapping image of the same name.

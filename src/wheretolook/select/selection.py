@@ -54,7 +54,7 @@ def select_views(
     if request.sigma_m or request.yaw_sigma_deg:
         prior = PoseUncertainty(request.sigma_m or 0.0, request.yaw_sigma_deg or 0.0)
         views = prior.with_expected_scores(views, candidates, progress)
-    return explained(reasons, replace(views, waypoint=rows[views.waypoint]))
+    return with_reasons(reasons, replace(views, waypoint=rows[views.waypoint])).in_frame(localization_map.frame)
 
 
 def _within_pitch(directions: Float, request: SelectionRequest) -> Float:
@@ -190,14 +190,12 @@ def reported(scorer: Scorer, waypoints: Waypoints, rows: NDArray[np.int64], pose
     return replace(views, waypoint=rows, waypoint_id=ids, read_as=read_as, rank=np.ones_like(rows))
 
 
-def explained(reasons: ReasonCounter, views: Views) -> Views:
-    """Return views with the numbers of landmarks that are hard to match, moved from the world to the map's own frame."""
-    frame = reasons.localization_map.frame
+def with_reasons(reasons: ReasonCounter, views: Views) -> Views:
+    """Return views in the world with the numbers of landmarks that are hard to match."""
     step = _views_at_once(reasons)
     poses = views.cam_from_world
     counts = Views.concatenate(reasons.count(poses[begin : begin + step]) for begin in range(0, len(poses), step))
-    in_map = frame.world_from_map.inverse.apply_to_poses(poses)
-    return replace(views, **{**counts.columns, "cam_from_world": in_map, "frame": frame})
+    return replace(views, **counts.columns)
 
 
 def _views_at_once(of_map: Scorer | ReasonCounter) -> int:

@@ -25,10 +25,11 @@ from wheretolook.mapping.config import FrameOptions
 from wheretolook.mapping.map_frame import MapFrame
 from wheretolook.scorers.base import Scorer
 from wheretolook.scorers.registry import make_scorer
-from wheretolook.scorers.weights import load_scorer, resolve_weights
-from wheretolook.select.selection import explained, reported, select_views
+from wheretolook.scorers.weights import resolve_weights
+from wheretolook.select.selection import reported, select_views, with_reasons
 from wheretolook.select.waypoints import SelectionRequest, Waypoints, grid_waypoints, usable_waypoints
 from wheretolook.space.mapped_space import MappedSpace
+from wheretolook.training.weights import method_of_weights
 from wheretolook.utils.devices import usable_device
 from wheretolook.utils.errors import ConfigError, MapError, PlanningError, check_names
 
@@ -63,7 +64,7 @@ class WhereToLook:
         self.scorer = scorer
         self._build = build
         self._accuracy: Accuracy | None = None
-        self._camera_of: dict[str, int] = {}  # camera_id by the name of an image, if each has its camera
+        self.camera_of: dict[str, int] = {}  # camera_id by the name of an image, if each has its camera
         self._space = space
         self._files = files
         axes = direction_lattice(500) if directions is None else np.asarray(directions, dtype=np.float64)
@@ -138,14 +139,16 @@ class WhereToLook:
         here = scene.localization_map
         weights = resolve_weights(method, weights, here.landmarks.features)
 
+        if not method:
+            assert weights is not None
+            method = method_of_weights(weights)
+
         def build(localization_map: LocalizationMap) -> Scorer:
-            if not method:
-                return load_scorer(localization_map, weights, anywhere)
             return make_scorer(method, localization_map, weights=weights, anywhere=anywhere)
 
         look = cls(build(here), axes, scene.space, files, build)
         if of_each and (images := scene.map.images) is not None:
-            look._camera_of = dict(zip(images.image_names, images.image_cameras.tolist(), strict=True))
+            look.camera_of = dict(zip(images.image_names, images.image_cameras.tolist(), strict=True))
         return look
 
     @property
@@ -255,20 +258,21 @@ class WhereToLook:
         waypoints = Waypoints.of(camera_centers(poses), names)
         rows = np.flatnonzero(usable_waypoints(self.localization_map, waypoints, skip))
         in_world = self.frame.world_from_map.apply_to_poses(poses)
-        if not self._camera_of:
-            return explained(self.reasons, reported(self.scorer, waypoints, rows, in_world[rows]))
-        camera_ids = np.array([self._camera_of.get(name, -1) for name in waypoints.ids])
+        if not self.camera_of:
+            views = with_reasons(self.reasons, reported(self.scorer, waypoints, rows, in_world[rows]))
+            return views.in_frame(self.frame)
+        camera_ids = np.array([self.camera_of.get(name, -1) for name in waypoints.ids])
         for row in rows[camera_ids[rows] < 0]:
             fix = "Name poses like images of the map, or give one camera: --camera-id or --camera, in Python camera."
-            problem = f"the map has {len({*self._camera_of.values()})} cameras, and a pose is of none of its images"
+            problem = f"the map has {len({*self.camera_of.values()})} cameras, and a pose is of none of its images"
             raise MapError(problem, path=waypoints.path, value=waypoints.ids[row], fix=fix)
         parts = []
         for number in np.unique(camera_ids[rows]).tolist():
             here = rows[camera_ids[rows] == number]
             look = self._of_camera(self.localization_map.map.cameras[number])
-            views = explained(look.reasons, reported(look.scorer, waypoints, here, in_world[here]))
+            views = with_reasons(look.reasons, reported(look.scorer, waypoints, here, in_world[here]))
             parts.append(replace(views, camera_id=np.full(len(views), number)))
-        together = replace(Views.concatenate(parts), camera=None)
+        together = replace(Views.concatenate(parts), camera=None).in_frame(self.frame)
         return together[np.argsort(together.waypoint, kind="stable")]
 
     def _of_camera(self, camera: Camera) -> WhereToLook:
@@ -312,7 +316,10 @@ class WhereToLook:
             return look.best(points, n, ids=ids, heading_deg=heading_deg, progress=progress, **options)
         waypoints = Waypoints.of(points, ids, heading_deg)
         check_names("option of best", options, SelectionRequest, ("ids", "heading_deg", "progress", "accuracy"))
-        request = SelectionRequest(n=n, **options)
+        return self.select(waypoints, SelectionRequest(n=n, **options), progress)
+
+    def select(self, waypoints: Waypoints, request: SelectionRequest, progress: bool = False) -> Views:
+        """Select the requested views at waypoints; raises as `best`."""
         return select_views(self.scorer, self.reasons, self.directions, waypoints, request, progress)
 
     def floor_plan(self, views: Views) -> Figure:

@@ -14,9 +14,10 @@ from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 import torch
-from lightning.pytorch import Callback, LightningDataModule, LightningModule, Trainer
+from lightning.pytorch import Callback, LightningDataModule, LightningModule, Trainer, seed_everything
 from lightning.pytorch.callbacks import Checkpoint, EarlyStopping
 from lightning.pytorch.strategies import DDPStrategy
+from lightning.pytorch.utilities.seed import isolate_rng
 from torch import Tensor, nn
 from torch.multiprocessing.spawn import ProcessException
 from torch.nn.functional import binary_cross_entropy_with_logits
@@ -171,6 +172,14 @@ class ViewpointClassifier(LightningModule):
 
 
 MONITORED = "val_average_precision"  # the metric that decides which epoch was best
+
+
+@contextmanager
+def seeded(seed: int) -> Iterator[None]:
+    """Seed all generators of random numbers, whose states are restored at the end of the block."""
+    with isolate_rng():
+        seed_everything(seed, verbose=False)
+        yield
 
 
 def home_device(config: SharedConfig) -> str:

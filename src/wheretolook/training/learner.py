@@ -10,6 +10,7 @@ import numpy as np
 import pandas as pd
 import torch
 from numpy.typing import ArrayLike, NDArray
+from sklearn.linear_model import LogisticRegression
 
 from wheretolook.dataset.layout import Dataset
 from wheretolook.geometry.camera import Camera
@@ -102,8 +103,6 @@ def fit_platt(logits: ArrayLike, labels: ArrayLike) -> tuple[float, float]:
 
     They are 1 and 0 if the scale would reverse the order, or the labels are of one class.
     """
-    from sklearn.linear_model import LogisticRegression
-
     values = np.asarray(logits, dtype=np.float64)
     truth = np.asarray(labels).astype(bool)
     if truth.all() or not truth.any():

@@ -391,8 +391,6 @@ def open_scene(
     `dataset.layout.find_scene`, MapError or TableError if the scene has not been mapped, WeightsError if the weights
     cannot be used.
     """
-    from wheretolook.dataset.viewpoint_table import CAMERA_ID, UNLABELLED
-
     if not data.is_dir():
         fix = "Make a scene first, such as by `wheretolook demo`, or name a model: --map SPARSE."
         raise TableError("there is no such folder of datasets", path=data, fix=fix)

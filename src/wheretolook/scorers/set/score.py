@@ -19,6 +19,7 @@ from torch import Tensor
 
 from wheretolook.dataset.config import Accuracy, checked_accuracy, threshold_key
 from wheretolook.geometry.camera import Camera
+from wheretolook.geometry.lattices import spread_rows
 from wheretolook.geometry.poses import Float, check_locations, check_poses, rotation_looking_along
 from wheretolook.geometry.views import Views
 from wheretolook.inputs.landmark_features import LandmarkDescriber, ViewLandmarks, ragged_blocks
@@ -343,7 +344,7 @@ def detection_offset(network: SetNetwork, localization_map: LocalizationMap) -> 
     log_odds: list[Tensor] = []
     weights: list[Tensor] = []
     seeing = np.flatnonzero(np.asarray(observes.sum(1)).reshape(-1))
-    for first in seeing[_spread(len(seeing), 8)]:
+    for first in seeing[spread_rows(len(seeing), 8)]:
         common = (observes @ observes[[first]].T).toarray().reshape(-1)
         block = np.argsort(-common, kind="stable")[: max(1, round(len(images.image_ids) / 8))]
         block = block[common[block] > 0]
@@ -351,7 +352,7 @@ def detection_offset(network: SetNetwork, localization_map: LocalizationMap) -> 
         if len(remaining) == 0:
             continue
         describer = LandmarkDescriber(replace(localization_map, map=Map(remaining)), network.attributes)
-        tested = block[_spread(len(block), 2)]
+        tested = block[spread_rows(len(block), 2)]
         n_observed += observes[tested][:, np.isin(images.point_ids, remaining.ids)].sum()
         for row in tested:
             camera = whole.cameras[int(images.image_cameras[row])]
@@ -369,11 +370,6 @@ def detection_offset(network: SetNetwork, localization_map: LocalizationMap) -> 
         return float((each * (odds + offset).sigmoid()).sum()) - n_observed
 
     return OFFSETS[min(bisect_left(OFFSETS, 0.0, key=surplus), len(OFFSETS) - 1)]
-
-
-def _spread(n: int, max_count: int) -> np.ndarray:
-    """Return at most so many evenly spread rows of n."""
-    return np.unique(np.linspace(0, n - 1, min(max_count, n)).round().astype(int))
 
 
 MAX_LANDMARKS = 1024

@@ -411,8 +411,8 @@ def pose_texts(cam_from_world: ArrayLike, exact: bool = False) -> list[str]:
     """
     values = pose_values(cam_from_world)
     decimals = 9 if np.abs(values[:, 4:]).max(initial=0) < 1000.0 else 15
-    pattern = ["{!r}"] * 7 if exact else [f"{{:.{decimals}f}}"] * 4 + ["{:.9f}"] * 3
-    return [" ".join(pattern).format(*row) for row in values.tolist()]
+    digits = [""] * 7 if exact else [f".{decimals}f"] * 4 + [".9f"] * 3
+    return [" ".join(map(format, row, digits)) for row in values.tolist()]
 
 
 def tum_text(stamps: Iterable[str], cam_from_world: ArrayLike) -> str:

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
@@ -200,6 +199,8 @@ def _keypoints_found(image: Any, path: Path, turned: bool) -> int:
 
     Most detectors find the same corners as SIFT, which is asked for 1,000.
     """
+    import cv2  # of an extra
+
     keypoints = np.array([point.xy for point in image.points2D if point.has_point3D()]).reshape(-1, 2)
     rgb = read_photograph(path, turned)
     rgb = reduce_photograph(rgb, max(image.camera.width, image.camera.height))

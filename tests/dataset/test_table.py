@@ -137,6 +137,7 @@ def test_damaged_files(compact, many, tmp_path):
         {"error_m": None},
         {"n_visible": pd.NA},
         {"location_id": pd.NA},
+        {"viewpoint_id": 1},
     ],
 )
 def test_columns_that_are_missing_or_invalid(change, many, tmp_path):

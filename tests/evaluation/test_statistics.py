@@ -6,7 +6,7 @@ from numpy.testing import assert_allclose
 from scipy import stats
 from scipy.special import expit
 from sklearn.calibration import calibration_curve
-from sklearn.metrics import log_loss, precision_recall_curve
+from sklearn.metrics import log_loss
 
 from wheretolook.evaluation.statistics import (
     BINS,
@@ -15,8 +15,6 @@ from wheretolook.evaluation.statistics import (
     expected_calibration_error,
     fit_temperature,
     negative_log_likelihood,
-    precision_area,
-    precision_over_coverage,
     reliability,
     scale_probability,
 )
@@ -82,29 +80,6 @@ def test_rows_before_and_after():
         assert part["ece"].iloc[0] == pytest.approx(expected_calibration_error(probability, good), abs=1e-9)
         assert part["nll"].iloc[0] == pytest.approx(log_loss(good, probability))
     assert set(calibration_rows(expit(logits), good, np.nan)["when"]) == {"before"}
-
-
-def test_precision_over_coverage():
-    """Precision as scikit-learn's at each threshold, ties included; queries without a pose only lower the coverage."""
-    rng = np.random.default_rng(4)
-    confidence = rng.integers(0, 20, 200) / 20
-    right = draw(rng, confidence)
-    coverage, precision = precision_over_coverage(confidence, right)
-    expected, _, thresholds = precision_recall_curve(right, confidence)
-    at = dict(zip(thresholds, expected, strict=False))
-    assert_allclose(precision, [at[value] for value in np.sort(confidence)[::-1]])
-    assert coverage[0] == 1 / 200 and coverage[-1] == 1
-    with_missing = np.append(confidence, np.full(200, np.nan)), np.append(right, np.zeros(200, dtype=bool))
-    assert precision_over_coverage(*with_missing)[0][-1] == 0.5
-    assert precision_area(*with_missing) == pytest.approx(precision_area(confidence, right) / 2)
-
-
-def test_area_of_a_perfect_order():
-    """Of n poses k are right and all more confident: 1 up to k / n, then k / i."""
-    right = np.arange(10) < 4
-    expected = (4 + sum(4 / i for i in range(5, 11))) / 10
-    assert precision_area(-np.arange(10.0), right) == pytest.approx(expected)
-    assert precision_area(np.full(3, np.nan), np.zeros(3, dtype=bool)) == 0
 
 
 # Bootstrap intervals and paired tests against closed forms, brute force and SciPy.

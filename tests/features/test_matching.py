@@ -10,8 +10,7 @@ from numpy.testing import assert_array_equal
 from numpy.typing import NDArray
 
 from twins.features import nearest
-from wheretolook.features import matching
-from wheretolook.features import matching as descriptor_index
+from wheretolook.features import matching, matching as descriptor_index
 from wheretolook.features.extractor import quantize_descriptors, unit_descriptors
 from wheretolook.features.matches import match
 from wheretolook.features.matching import MAX_NEAREST, DescriptorIndex, DescriptorMatcher, has_index

@@ -351,6 +351,14 @@ def test_a_pose_from_few_matches_becomes_more_accurate():
     assert error < 0.3 * error_alone and error < 0.01
 
 
+def test_an_estimated_focal_length_near_the_assumed_one_is_that():
+    """Landmarks and the lens err alike for many keypoints: by up to some of their standard deviations."""
+    prior = FocalPrior((500.0,), (0.0,))
+    assert prior.posterior(np.log(505.0), 0.002**2)[0] == np.log(500.0)
+    mean, variance = prior.posterior(np.log(600.0), 0.002**2)
+    assert mean == np.log(600.0) and variance > 0.004**2
+
+
 def test_an_assumed_focal_length_that_a_wall_does_not_determine_makes_the_pose_uncertain():
     points = a_room(2000)
     points[:, 0] = 4.0  # a wall, which the camera faces: distance and focal length are exchangeable

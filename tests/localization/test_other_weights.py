@@ -55,6 +55,6 @@ def test_without_photographs_names_state_the_weights(tmp_path):
 
     with pytest.raises(MapError, match="aliked-n16"):
         opened("aliked-n16rot.pth")
-    assert opened("aliked-n16.pth").features_from == "aliked aliked-n16, by the features' name"
+    assert opened("aliked-n16.pth").features_from == "aliked aliked-n16"
     with pytest.warns(MapWarning, match="aliked-n16 are assumed to be by"):
         assert opened("mine.pth").features_from == "assumed: aliked mine"

@@ -63,6 +63,8 @@ def virtual(h5py, file):
         replaced(data=np.full((N, 2), np.nan)),
         replaced("descriptors", data=np.full((128, N), np.nan)),
         replaced("descriptors", data=np.zeros((64, N))),
+        replaced("descriptors", data=np.zeros((128, N - 1))),
+        replaced(data=KEYPOINTS[0][:, :1]),
         replaced(data=KEYPOINTS[0][:-1]),
         lambda h5py, file: file.pop("0.png"),
         lambda h5py, file: file["0.png"].pop("descriptors"),

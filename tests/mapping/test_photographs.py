@@ -130,8 +130,9 @@ def test_the_resolution_of_a_sensor_is_that_of_the_photograph_as_taken(tmp_path)
     exif.get_ifd(EXIF_IFD).update({0x920A: 5.0, 0xA20E: 800.0, 0xA210: 4, 0xA002: 4000, 0xA003: 3000})  # 4,000 px wide
     Image.fromarray(sized(300, 400)).save(tmp_path / "small.jpg", exif=exif)
     assert exif_focal_px(tmp_path / "small.jpg") == pytest.approx(5 * 800 / 10)
-    save(tmp_path / "none.jpg", sized(300, 400))
-    assert exif_focal_px(tmp_path / "none.jpg") is None
+    for name, focal_mm in (("none.jpg", 0), ("short.jpg", 1), ("long.jpg", 65535)):
+        save(tmp_path / name, sized(300, 400), focal_mm=focal_mm)
+        assert exif_focal_px(tmp_path / name) is None
 
 
 @pytest.mark.parametrize("as_upright", [False, True])

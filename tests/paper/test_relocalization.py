@@ -3,8 +3,10 @@
 import numpy as np
 import pandas as pd
 import pytest
+from numpy.testing import assert_allclose
+from sklearn.metrics import precision_recall_curve
 
-from wheretolook_paper.relocalization import summarize, summary_markdown
+from wheretolook_paper.relocalization import precision_area, precision_over_coverage, summarize, summary_markdown
 from wheretolook_paper.studies.fit_confidence import fit, is_within, predict
 
 
@@ -57,3 +59,26 @@ def test_a_fit_recovers_the_distribution_of_errors():
     found = predict(model, poses, (0.03, 0.3))
     assert found.mean() == pytest.approx(is_within(poses, (0.03, 0.3)).mean(), abs=0.02)
     assert predict(model, poses, (0.5, 5.0)).mean() == pytest.approx(near.mean(), abs=0.03)
+
+
+def test_precision_over_coverage():
+    """Precision as scikit-learn's at each threshold, ties included; queries without a pose only lower the coverage."""
+    rng = np.random.default_rng(4)
+    confidence = rng.integers(0, 20, 200) / 20
+    right = rng.random(200) < confidence
+    coverage, precision = precision_over_coverage(confidence, right)
+    expected, _, thresholds = precision_recall_curve(right, confidence)
+    at = dict(zip(thresholds, expected, strict=False))
+    assert_allclose(precision, [at[value] for value in np.sort(confidence)[::-1]])
+    assert coverage[0] == 1 / 200 and coverage[-1] == 1
+    with_missing = np.append(confidence, np.full(200, np.nan)), np.append(right, np.zeros(200, dtype=bool))
+    assert precision_over_coverage(*with_missing)[0][-1] == 0.5
+    assert precision_area(*with_missing) == pytest.approx(precision_area(confidence, right) / 2)
+
+
+def test_area_of_a_perfect_order():
+    """Of n poses k are right and all more confident: 1 up to k / n, then k / i."""
+    right = np.arange(10) < 4
+    expected = (4 + sum(4 / i for i in range(5, 11))) / 10
+    assert precision_area(-np.arange(10.0), right) == pytest.approx(expected)
+    assert precision_area(np.full(3, np.nan), np.zeros(3, dtype=bool)) == 0

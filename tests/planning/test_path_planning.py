@@ -10,8 +10,13 @@ import pytest
 
 from selection.room import write_room
 from wheretolook.geometry.lattices import VoxelGrid, axes_of_angles, fibonacci_sphere
-from wheretolook.geometry.poses import pan_tilt_angles, pan_tilt_turns_deg, rotation_angle_deg, rotation_looking_along
-from wheretolook.geometry.poses import turns_deg as turns_deg_of_cameras
+from wheretolook.geometry.poses import (
+    pan_tilt_angles,
+    pan_tilt_turns_deg,
+    rotation_angle_deg,
+    rotation_looking_along,
+    turns_deg as turns_deg_of_cameras,
+)
 from wheretolook.planning.config import PathConfig
 from wheretolook.planning.routes import turned_evenly
 from wheretolook.planning.rrt import are_separate, plan_path

@@ -9,8 +9,7 @@ from scipy import ndimage
 
 from wheretolook.scenes.config import ApartmentConfig
 from wheretolook.utils.errors import ConfigError
-from wheretolook_rooms import decor, fixtures, furniture
-from wheretolook_rooms import patches as patches_module
+from wheretolook_rooms import decor, fixtures, furniture, patches as patches_module
 from wheretolook_rooms.generator import furnish_apartment
 from wheretolook_rooms.materials import plain
 from wheretolook_rooms.plan import draw_plan

@@ -17,8 +17,7 @@ import pandas as pd
 ROOT = Path(__file__).parents[2]
 sys.path[:0] = [str(ROOT / "tests"), str(ROOT / "tests" / "benchmarks"), str(ROOT / "src" / "wheretolook_ros")]
 
-from common import options as parse_options
-from common import write_csv
+from common import options as parse_options, write_csv
 
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import pan_tilt_angles, pose_error, poses_looking_along

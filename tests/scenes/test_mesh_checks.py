@@ -53,6 +53,11 @@ BROKEN = {
         .export(file_type="ply", encoding="ascii")
         .replace(b"vertex 4", b"vertex 300000000")
     },
+    "a text that is cut": {
+        "a.ply": trimesh.Trimesh(VERTICES, FACES, process=False)
+        .export(file_type="ply", encoding="ascii")
+        .rpartition(b"\n3 ")[0]
+    },
     "a vertex out of range": {"a.obj": obj(faces="f 1 2 99\n")},
     "a vertex before the first": {"a.obj": obj(faces="f 1 2 -9\n")},
     "too many parts": {"a.obj": obj(faces="".join(f"usemtl m{i}\nf 1 2 3\n" for i in range(20_000)))},
@@ -220,6 +225,8 @@ def as_fans(tree, _):
         (with_extension("EXT_meshopt_compression"), "EXT_meshopt_compression"),
         (with_extension("EXT_mesh_gpu_instancing", required=False), "EXT_mesh_gpu_instancing"),
         (as_fans, "triangle fans"),
+        (lambda tree, _: {**tree, "nodes": [{"mesh": 0, "skin": 0}]}, "skins"),
+        (lambda tree, _: {**tree, "meshes": [{**tree["meshes"][0], "weights": [0.0, 0.5]}]}, "morph targets"),
     ],
 )
 def test_geometry_that_is_not_read_is_named(whole, change, value):

@@ -9,8 +9,7 @@ import pytest
 
 from box_scenes import furnished_room
 from selection.room import POINTS, WEIGHTS, write_room
-from wheretolook import LocalizationMap, load_scorer, poses_looking_along
-from wheretolook import WhereToLook as Exported
+from wheretolook import LocalizationMap, WhereToLook as Exported, load_scorer, poses_looking_along
 from wheretolook.geometry.camera import ColmapCamera, PinholeCamera
 from wheretolook.geometry.lattices import direction_lattice
 from wheretolook.geometry.pose_files import images_text, tum_text

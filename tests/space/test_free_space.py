@@ -5,8 +5,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from box_scenes import CABINET, ROOM, TABLE_TOP, box_quads, furnished_room, quads_mesh
-from depth_room import CAMERA, depth_images, room
-from depth_room import ROOM as DEPTH_ROOM
+from depth_room import CAMERA, ROOM as DEPTH_ROOM, depth_images, room
 from wheretolook.geometry.mesh import TexturedMesh
 from wheretolook.geometry.poses import poses_looking_along
 from wheretolook.geometry.tsdf import DepthImage, TsdfVolume

@@ -31,8 +31,7 @@ from wheretolook.mapping.colmap_model import read_model
 from wheretolook.mapping.config import FrameOptions, place_name
 from wheretolook.mapping.map_frame import find_frame
 from wheretolook.scorers.weights import resolve_weights
-from wheretolook.tracking import TrackingConfig, check_store, kept_if_not_logged, start_run
-from wheretolook.tracking import log as log_to_run
+from wheretolook.tracking import TrackingConfig, check_store, kept_if_not_logged, log as log_to_run, start_run
 from wheretolook.utils.errors import ConfigError, MapError, SceneError, TableError, check_positive, check_range, reject
 from wheretolook.utils.files import missing_folders, remove_if_empty, storage_errors, write_text
 from wheretolook.utils.processes import hold

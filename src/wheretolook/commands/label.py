@@ -30,8 +30,7 @@ from wheretolook.dataset.dataset_lock import changes_dataset
 from wheretolook.dataset.layout import Dataset, SceneFolder
 from wheretolook.features.extractor import ExtractorConfig
 from wheretolook.localization.confidence import RIGHT_PLACE_LIMITS
-from wheretolook.tracking import TrackingConfig, check_store, kept_if_not_logged, start_run
-from wheretolook.tracking import log as log_to_run
+from wheretolook.tracking import TrackingConfig, check_store, kept_if_not_logged, log as log_to_run, start_run
 from wheretolook.utils.errors import MapError, SceneError, TableError
 from wheretolook.utils.files import cache_key, read_json_object, write_json, write_text
 from wheretolook.utils.package import reports

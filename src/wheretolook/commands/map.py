@@ -296,9 +296,11 @@ def _import_model(options: BuildMap, log: Log) -> tuple[SceneFolder, Dataset]:
     from wheretolook.rendering.raycasting import MeshRaycaster
     from wheretolook.scenes.loading import load_mesh, save_glb
 
-    loaded = None if options.mesh is None else load_mesh(options.mesh, options.mesh_up, colored=False)
-    if options.mesh is not None and loaded is not None and model.num_points3D():
-        check_overlap(options.mesh, [point.xyz for point in model.points3D.values()], loaded.bounds)
+    loaded = None
+    if options.mesh is not None:
+        loaded = load_mesh(options.mesh, options.mesh_up, colored=False)
+        if model.num_points3D():
+            check_overlap(options.mesh, [point.xyz for point in model.points3D.values()], loaded.bounds)
     cache.clear()
     report = map_existing(
         settings,

@@ -13,8 +13,7 @@ from wheretolook.commands.options import Log, Progress, ignore_progress, load_da
 from wheretolook.dataset.dataset_lock import reads_dataset
 from wheretolook.planning.config import PlanConfig
 from wheretolook.planning.view_sequence import lengths_along
-from wheretolook.tracking import TrackingConfig, check_store, joined, kept_if_not_logged, start_run
-from wheretolook.tracking import log as log_to_run
+from wheretolook.tracking import TrackingConfig, check_store, joined, kept_if_not_logged, log as log_to_run, start_run
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.files import write_text
 from wheretolook.utils.package import reports, require

@@ -17,11 +17,11 @@ from wheretolook.tracking import (
     TrackingConfig,
     check_store,
     kept_if_not_logged,
+    log as log_to_run,
     log_history,
     start_run,
     warn_not_logged,
 )
-from wheretolook.tracking import log as log_to_run
 from wheretolook.training.provenance import (
     HISTORY_CSV,
     NOT_LOGGED,

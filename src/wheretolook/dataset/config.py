@@ -89,7 +89,7 @@ class SampleConfig(ViewLattice):
             photographs of a sequence are to each other; needs a grid of about 20 cm.
 
     Attributes:
-        distinct_pixels: recorded with samples; landmarks are counted, and `wheretolook_paper.visibility` counts pixels.
+        distinct_pixels: recorded with samples; landmarks are counted, several on a pixel as several.
         memory_gb: bound on the memory that counting takes on its device, in 10^9 bytes; two million landmarks fit.
     """
 

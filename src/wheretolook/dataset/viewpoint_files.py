@@ -141,6 +141,8 @@ def read_table(path: Path, matches: bool = False, pixels: bool = False) -> pd.Da
             if lacking:
                 raise ValueError(f"values are missing in {', '.join(lacking)}")
             frame: pd.DataFrame = content.to_pandas()
+            if not frame["viewpoint_id"].is_unique:
+                raise ValueError("a viewpoint_id is there twice")
     except ValueError as error:
         raise TableError(f"not a readable table of viewpoints: {error}", path=path, fix=fix) from error
     length = np.linalg.norm(frame[[*QUATERNION_COLUMNS]], axis=1)

@@ -9,10 +9,15 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from wheretolook.dataset.config import ALL, THRESHOLDS, Split, threshold_key
-from wheretolook.dataset.config import LOCALIZED as LOCALIZED
-from wheretolook.dataset.config import NO_POSE as NO_POSE
-from wheretolook.dataset.config import TOO_FEW_MATCHES as TOO_FEW_MATCHES
+from wheretolook.dataset.config import (
+    ALL,
+    LOCALIZED as LOCALIZED,
+    NO_POSE as NO_POSE,
+    THRESHOLDS,
+    TOO_FEW_MATCHES as TOO_FEW_MATCHES,
+    Split,
+    threshold_key,
+)
 from wheretolook.geometry.pose_files import POSE_COLUMNS, pose_values, poses_of_values
 from wheretolook.geometry.poses import Float, camera_centers
 from wheretolook.utils.errors import TableError

@@ -153,27 +153,6 @@ def expected_calibration_error(probability: Float, good: Labels, bins: int = BIN
     return float((curve["n"] * (curve["mean_predicted"] - curve["share_good"]).abs()).sum() / curve["n"].sum())
 
 
-def precision_over_coverage(confidence: Float, right: Labels) -> tuple[Float, Float]:
-    """Compute the share of right poses among the most confident ones, by the share of the queries that these are.
-
-    Given the confidence (B,) in each query's pose, not finite without a pose, and whether it is right (B,). Returns the
-    coverage k / B and the precision (P,) of the k most confident of P poses; equal confidences count as one threshold.
-    The mean of the precision over all queries, 0 where there is no pose, is `precision_area` (Arnold et al., ECCV 2022).
-    """
-    order = np.argsort(-confidence[np.isfinite(confidence)], kind="stable")
-    sorted_confidence = confidence[np.isfinite(confidence)][order]
-    n_right = np.cumsum(right[np.isfinite(confidence)][order])
-    # all poses of the same confidence are accepted together
-    last = np.searchsorted(-sorted_confidence, -sorted_confidence, side="right")
-    count = np.arange(1, len(order) + 1)
-    return count / max(len(confidence), 1), n_right[last - 1] / last
-
-
-def precision_area(confidence: Float, right: Labels) -> float:
-    """Compute the area under `precision_over_coverage` in [0, 1]."""
-    return float(precision_over_coverage(confidence, right)[1].sum() / max(len(confidence), 1))
-
-
 def negative_log_likelihood(probability: Float, good: Labels) -> float:
     """Compute the mean negative log-likelihood of labels (B,) under probabilities (B,), in nats."""
     return _mean_loss(finite_log_odds(probability, MARGIN), good)

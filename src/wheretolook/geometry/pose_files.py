@@ -15,8 +15,7 @@ from functools import cached_property
 from itertools import islice
 from mmap import ACCESS_READ, mmap
 from pathlib import Path
-from struct import Struct
-from struct import error as StructError
+from struct import Struct, error as StructError
 from typing import Any
 
 import numpy as np
@@ -226,13 +225,13 @@ def _with_names(path: Path, header: tuple[str, ...], rows: list[tuple[int, list[
 def _without_names(path: Path, rows: list[tuple[int, list[str]]], of_cameras: bool) -> NamedRows:
     """Recognize rows without names of their columns by the number of cells, unit quaternions and rotations."""
     n = len(rows[0][1])
-    if n == 4:
-        names = [cells[0] for _, cells in rows]
-        numbers = np.array([float(name) for name in names]) if all(map(_is_number, names)) else np.zeros(0)
-        is_whole = len({*names}) == len(names) and (numbers % 1 == 0).all()
-        if not is_whole and not (np.diff(numbers) > 0).all():  # neither numbers of rows nor times
+    if n == 4 and all(_is_number(cells[0]) for _, cells in rows):
+        first = NamedRows(path, ("id", *"xyz"), rows).numbers(["id"])[:, 0]
+        if (np.diff(first) <= 0).any() and (
+            (first % 1).any() or len({*first}) < len(first)
+        ):  # neither times nor numbers
             fix = "Start the file with '# x y z yaw_deg' or '# id x y z'."
-            problem = "four columns of numbers do not show whether they are a name and x y z, or x y z and a yaw"
+            problem = "four columns of numbers do not show whether they are id x y z, or x y z and a yaw"
             raise TableError(problem, path=path, value=" ".join(rows[0][1])[:80], fix=fix)
     if n in (3, 4):
         return NamedRows(path, ("id", *"xyz")[4 - n :], rows, "name x y z" if n == 4 else "x y z")

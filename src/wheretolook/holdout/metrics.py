@@ -13,8 +13,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 from scipy.cluster.hierarchy import fcluster, linkage
-from scipy.stats import rankdata
-from scipy.stats import t as student
+from scipy.stats import rankdata, t as student
 
 from wheretolook.evaluation.statistics import BINS, ClusterBootstrap, bins_of, divide
 from wheretolook.geometry.poses import Float

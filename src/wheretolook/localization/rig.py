@@ -73,12 +73,15 @@ class FocalPrior:
         deviations: (K,) one standard deviation of the log of each: 0 for that of a mapping camera, which is the same or
             another one; EXIF data are rounded.
         p_any: probability of any other focal length, from the smallest value / `span` to the largest times `span`.
+        common: ratio of the error of an estimated focal length to its deviation by independent keypoints, since landmarks
+            and the lens err alike for many: up to 2 for most photographs of cameras, 7 for a film by a phone.
     """
 
     focal_px: tuple[float, ...]
     deviations: tuple[float, ...]
     p_any: float = 0.5
     span: float = 1.6
+    common: float = 3.0
 
     @property
     def log_range(self) -> tuple[float, float]:
@@ -93,8 +96,9 @@ class FocalPrior:
     def posterior(self, log_focal: float, variance: float) -> tuple[float, float]:
         """Return the log of the most probable focal length, and the mean squared error of this log.
 
-        Takes the log as estimated from an image, with its variance.
+        Takes the log as estimated from an image, with its variance by independent keypoints.
         """
+        variance = variance * self.common**2
         low, high = self.log_range
         prior = np.square([*self.deviations])
         total = prior + variance

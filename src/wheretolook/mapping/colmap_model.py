@@ -14,8 +14,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from mmap import ACCESS_READ, mmap
 from pathlib import Path
-from struct import Struct
-from struct import error as StructError
+from struct import Struct, error as StructError
 from typing import TYPE_CHECKING, Any
 
 import numpy as np

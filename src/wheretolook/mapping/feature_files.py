@@ -256,6 +256,8 @@ def _open_hdf5(path: Path) -> Iterator[Callable[[str], _Features]]:
                 # hloc counts pixels from the centre of the top-left one, COLMAP from its corner
                 keypoints = _array(_member(image, "keypoints"), name).astype(np.float64)[:, :2] + 0.5
                 descriptors = _array(_member(image, "descriptors"), name).T
+                if keypoints.shape != (len(descriptors), 2):
+                    raise ValueError(f"keypoints and descriptors of {name} do not match")
                 kind: DescriptorKind | None = SIFT
                 may_be_sift = descriptors.shape[1] == SIFT.dimension and named in (None, SIFT)
                 if not may_be_sift or (len(descriptors) and descriptors.min() < 0):

@@ -142,22 +142,24 @@ def exif_focal_px(path: Path) -> float | None:
 
     tags = exif_of(path)
     unit_mm = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}.get(tags.get(0xA210, 2), 25.4)
+    focal_px = longer = 0.0
     try:
         with Image.open(path) as photograph:
             longer = max(photograph.size)
         taken = max(tags.get(0xA002, 0), tags.get(0xA003, 0)) or longer
-        focal_px = float(tags[0x920A]) * float(tags[0xA20E]) / unit_mm * longer / taken
-        if not tags.get(0xA405) and 0.1 * longer < focal_px < 100 * longer:
-            return focal_px
+        if not tags.get(0xA405):  # of 35 mm film, which COLMAP reads
+            focal_px = float(tags[0x920A]) * float(tags[0xA20E]) / unit_mm * longer / taken
     except (OSError, KeyError, TypeError, ValueError, ZeroDivisionError):
         pass  # without a resolution of the sensor
-    try:
-        with quiet_colmap():
-            options = pycolmap.ImageReaderOptions(camera_model="SIMPLE_PINHOLE")
-            camera = pycolmap.infer_camera_from_image(path, options)
-    except (ValueError, RuntimeError):  # a format that COLMAP does not read
-        return None
-    return float(camera.mean_focal_length()) if camera.has_prior_focal_length else None
+    if not 0.1 * longer < focal_px < 100 * longer:
+        try:
+            with quiet_colmap():
+                options = pycolmap.ImageReaderOptions(camera_model="SIMPLE_PINHOLE")
+                camera = pycolmap.infer_camera_from_image(path, options)
+        except (ValueError, RuntimeError):  # a format that COLMAP does not read
+            return None
+        focal_px = camera.mean_focal_length() if camera.has_prior_focal_length else 0.0
+    return float(focal_px) if 0.1 * longer < focal_px < 100 * longer else None
 
 
 def reduce_photograph(rgb: NDArray[np.uint8], max_side_px: int) -> NDArray[np.uint8]:

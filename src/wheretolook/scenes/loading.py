@@ -161,9 +161,8 @@ def _glb_textures(path: Path) -> Iterator[Path | bytes]:
     shown = [meshes[node["mesh"]] for node in tree.get("nodes", []) if "mesh" in node]
     if sum(map(len, meshes + shown)) > 40_000:  # trimesh takes 0.3 ms for each
         raise ValueError("its meshes and nodes have more than 40,000 parts; join them")
-    n_corners = 0
-    for part in itertools.chain.from_iterable(shown):
-        n_corners += accessors[part.get("indices", part["attributes"]["POSITION"])]["count"]
+    drawn = [part.get("indices", part["attributes"]["POSITION"]) for part in itertools.chain.from_iterable(shown)]
+    n_corners = sum(accessors[at]["count"] for at in drawn)
     if n_corners > fitting(200):  # bytes of a corner while it is read
         raise ValueError(f"its nodes have {n_corners // 3:,} triangles together")
     buffers = _buffers(tree, content, path)
@@ -201,6 +200,8 @@ def _check_readable(tree: dict[str, Any], path: Path) -> None:
         name for name in tree.get("extensionsRequired", []) if not re.match("KHR_(mat|tex|lig|mesh_q)|EXT_tex", name)
     }
     unread |= {"EXT_mesh_gpu_instancing"} & {*tree.get("extensionsUsed", [])}
+    unread |= {"skins" for node in tree.get("nodes", []) if "skin" in node}
+    unread |= {"morph targets" for mesh in tree.get("meshes", []) if any(mesh.get("weights", ()))}
     if any("bufferView" not in position or "sparse" in position for position in positions):
         unread |= {name for primitive in primitives for name in primitive.get("extensions", {})} or {"sparse accessors"}
     if any(primitive.get("mode") == 6 for primitive in primitives):
@@ -227,12 +228,12 @@ def _with_all_applied(path: Path) -> tuple[io.BytesIO, str] | None:
     for primitive in primitives:
         material = tree["materials"][primitive["material"]] if "material" in primitive else {}
         texture = material.get("pbrMetallicRoughness", {}).get("baseColorTexture", {})
-        transform = texture.get("extensions", {}).get("KHR_texture_transform")
-        if transform:
-            chosen = transform.get("texCoord", texture.get("texCoord", 0))
-            changed.append(({**accessors[primitive["attributes"][f"TEXCOORD_{chosen}"]]}, transform))
+        if transform := texture.get("extensions", {}).get("KHR_texture_transform"):
+            chosen = {**texture, **transform}.get("texCoord", 0)
+            accessor = {**accessors[primitive["attributes"][f"TEXCOORD_{chosen}"]]}
             primitive["attributes"]["TEXCOORD_0"] = len(accessors)
-            accessors.append(changed[-1][0])
+            accessors.append(accessor)
+            changed.append((accessor, transform))
     if not changed:
         return None
     buffers = _buffers(tree, content, path)
@@ -307,10 +308,14 @@ def _at_uri(uri: str, path: Path) -> Path | bytes:
 
 
 def _ply_textures(path: Path) -> Iterator[Path | bytes]:
-    """Textures that a PLY file names in comments."""
+    """Textures that a PLY file names in comments. Raises ValueError if it is a text with fewer rows than it states."""
     with path.open("rb") as file:
-        header = file.read(1 << 16).partition(b"end_header")[0]
-    for line in header.decode("utf-8", errors="replace").splitlines():
+        start, _, rest = file.read(1 << 16).partition(b"end_header")
+        header = start.decode("utf-8", errors="replace")
+        stated = sum(map(int, re.findall(r"^element \S+ (\d+)", header, re.M)))
+        if "format ascii" in header and rest.count(b"\n") + sum(1 for _ in file) < stated:
+            raise ValueError(f"fewer rows than the {stated:,} of its header")
+    for line in header.splitlines():
         if line.lower().startswith("comment texturefile "):
             yield _sibling(path, line.strip()[len("comment texturefile ") :].strip())
 

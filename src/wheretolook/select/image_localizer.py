@@ -141,7 +141,7 @@ class ImageLocalizer:
 
     @cached_property
     def features_from(self) -> str:
-        """The extractor of images, and how it is known to be the map's; "assumed: ..." if the weights are not known.
+        """The extractor of images; "assumed: ..." if it is not known that the map's features have its weights.
 
         Learned descriptors are compared in two photographs, otherwise by the files' names. A `MapWarning` names weights
         that are assumed. Raises MapError for others than the map's.
@@ -160,13 +160,13 @@ class ImageLocalizer:
                 image = self.images.read(path, name, self.images.cameras[int(images.image_cameras[row])])
                 photographs.append((int(row), image.rgb, image.camera))
         if self._localizer.check_weights(images, photographs):
-            return f"{extractor}, compared in photographs"
+            return extractor
         of_map = "" if self.features is None else weights_in_name(self.features)
         if used and of_map and used != of_map:
             fix = f"Give --extractor {self.extractor.method} --extractor-weights {of_map}.pth."
             raise MapError(f"the map has features of {of_map}", path=self.features, value=weights, fix=fix)
         if used == of_map or self.features is None or self.features.suffix not in HDF5_SUFFIXES:
-            return f"{extractor}, by the features' name"
+            return extractor
         text = f"{self.features}: features of {of_map or self.landmarks.features} are assumed to be by {weights}"
         warnings.warn(text, MapWarning, stacklevel=3)
         return f"assumed: {extractor}"

@@ -99,7 +99,6 @@ class QueryImages:
         is unknown or has other proportions.
         """
         path = None if isinstance(image, np.ndarray) else Path(image)
-        known, known_from = self._known(path, name, camera)
         if isinstance(image, np.ndarray):
             if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3 or 0 in image.shape:
                 raise PoseError("an image is an array (H, W, 3) uint8", value=(image.shape, str(image.dtype)))
@@ -108,14 +107,7 @@ class QueryImages:
             readings = [read_photograph(Path(image), self.upright)]
             if quarters_upright(Path(image)):
                 readings.append(read_photograph(Path(image), not self.upright))
-        of_map = known_from.partition("mapping image ")[2]
-        if (
-            path is not None
-            and known is not None
-            and of_map
-            and not self._is_mapping_image(path, readings, of_map, known)
-        ):
-            known = None  # another image of this name
+        known, known_from = self._known(path, name, camera, readings)
         candidates = [*self.cameras.values()] if known is None else [known]
         fitting = [rgb for rgb in readings if any(_has_proportions(one, rgb) for one in candidates)]
         rgb = (fitting or readings)[0]
@@ -136,7 +128,7 @@ class QueryImages:
     def _photographs(self) -> Path | None:
         return find_photographs(self.folder)
 
-    def _is_mapping_image(self, path: Path, readings: Sequence[NDArray[np.uint8]], name: str, camera: Camera) -> bool:
+    def _is_mapping_image(self, path: Path, readings: Sequence[NDArray[np.uint8]], name: str) -> bool:
         """Test whether a file is the mapping image of this name, not another zoom, size or place.
 
         It is the same file, or has its size and EXIF focal length. Where the photographs are not found, it must have the
@@ -147,12 +139,16 @@ class QueryImages:
         if original is not None:
             same_focal = in_exif is not None and in_exif == exif_focal_px(original)  # in pixels of its size
             return same_focal or filecmp.cmp(path, original, shallow=False)
-        longer = max(readings[0].shape)
-        fits = longer >= max(camera.width, camera.height) and any(_has_proportions(camera, rgb) for rgb in readings)
-        expected = camera.colmap.mean_focal_px * longer / max(camera.width, camera.height)
-        return fits and (in_exif is None or bool(abs(np.log(in_exif / expected)) < 0.05))  # as in `_assumed`
+        camera = self.by_name[name]
+        ratio = max(readings[0].shape) / max(camera.width, camera.height)
+        agrees = (
+            in_exif is None or abs(np.log(in_exif / (camera.colmap.mean_focal_px * ratio))) < 0.05
+        )  # as in `_assumed`
+        return ratio >= 1 and bool(agrees) and any(_has_proportions(camera, rgb) for rgb in readings)
 
-    def _known(self, path: Path | None, name: str, given: KnownCamera | None) -> tuple[Camera | None, str]:
+    def _known(
+        self, path: Path | None, name: str, given: KnownCamera | None, readings: Sequence[NDArray[np.uint8]]
+    ) -> tuple[Camera | None, str]:
         """Return the camera that was given or listed, or that of the mapping image of the same name.
 
         Names are the longest ends of the path that are known, at least the file name.
@@ -166,7 +162,9 @@ class QueryImages:
         if given is not None or path is None:
             return given, "given"
         found = next((end for end in ends if end in self.by_name), None)
-        return (None, "") if found is None else (self.by_name[found], f"mapping image {found}")
+        if found is None or not self._is_mapping_image(path, readings, found):
+            return None, ""
+        return self.by_name[found], f"mapping image {found}"
 
     def _assumed(self, path: Path | None, name: str, rgb: NDArray[np.uint8]) -> QueryImage:
         """Assume the camera of an image: one of the map, whatever the EXIF data say, or a pinhole by these."""

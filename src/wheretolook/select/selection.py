@@ -20,8 +20,6 @@ from wheretolook.scorers.base import Scorer
 from wheretolook.select.waypoints import SelectionRequest, Waypoints, usable_waypoints
 from wheretolook.utils.errors import ConfigError
 
-SIGHT_LINES = 1 << 24  # lines of sight tested at once
-
 
 def select_views(
     scorer: Scorer,
@@ -199,7 +197,7 @@ def with_reasons(reasons: ReasonCounter, views: Views) -> Views:
 
 
 def _views_at_once(of_map: Scorer | ReasonCounter) -> int:
-    return max(1, SIGHT_LINES // max(1, len(of_map.localization_map.landmarks)))
+    return max(1, (1 << 24) // max(1, len(of_map.localization_map.landmarks)))  # lines of sight tested at once
 
 
 @dataclass(frozen=True)

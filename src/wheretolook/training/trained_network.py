@@ -35,10 +35,6 @@ QUANTITIES = {
 
 ANGLES = ("across_deg", "down_deg")
 DISTANCES = ("distance_m", "depth_m")
-
-MAX_DISTANCE_QUANTILE = 0.975
-"""Of the training views, bounds distances from above. Three quarters of the farther ones are of three scenes, and scenes
-that are scaled in training show the same surfaces: neither covers spaces of that size."""
 MARGIN = 1.25  # factor that widens the range beyond these quantiles; for angles, degrees
 MARGIN_DEG = 2.0
 
@@ -60,7 +56,9 @@ class TrainingRange:
                 low, high = np.quantile(known, (0.005, 0.995)).tolist()
                 wider = (low - MARGIN_DEG, high + MARGIN_DEG) if name in ANGLES else (low / MARGIN, high * MARGIN)
                 if name in DISTANCES:
-                    wider = low / MARGIN, float(np.quantile(known, MAX_DISTANCE_QUANTILE))
+                    # three quarters of the farther views are of three scenes, and scenes that are scaled in training
+                    # show the same surfaces: neither covers spaces of that size
+                    wider = low / MARGIN, float(np.quantile(known, 0.975))
                 bounds[name] = (round(wider[0], 4), round(wider[1], 4))
         return cls(bounds)
 

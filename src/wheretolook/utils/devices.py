@@ -10,7 +10,6 @@ from functools import cache
 from typing import Any, TypeVar
 
 from wheretolook.utils.errors import ConfigError
-from wheretolook.utils.processes import cores
 from wheretolook.utils.texts import LOG
 
 
@@ -97,17 +96,6 @@ def run_halving(run: Callable[[Any], Any], batch: Any) -> Any:
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
-
-
-def run_in_parts(n_rows: int, rows_at_once: int, work: Callable[[slice], None], device: str = "cpu") -> None:
-    """Call `work` with slices of at most `rows_at_once` rows that cover `n_rows` rows.
-
-    On the CPU, `work` is called from as many threads as there are cores, unless there is a single slice only. NumPy,
-    PyTorch and Warp release Python's lock while they compute, so that the threads use several cores.
-    """
-    parts = [slice(start, min(start + rows_at_once, n_rows)) for start in range(0, n_rows, rows_at_once)]
-    threads = min(len(parts), cores()) if device == "cpu" else 1
-    list(in_threads(work, parts, threads))
 
 
 def in_threads(work: Callable[[Item], Result], items: Sequence[Item], threads: int) -> Iterator[Result]:

@@ -20,7 +20,6 @@ from wheretolook.scenes.loading import glb_bytes
 
 Rgb = NDArray[np.uint8]
 
-UNKNOWN = (120, 120, 120)  # colour of NaN
 TRUE_POSITIVE = (0, 158, 115)
 TRUE_NEGATIVE = (150, 150, 150)
 FALSE_POSITIVE = (213, 94, 0)
@@ -31,13 +30,9 @@ CAMERA_COLOR = (86, 180, 233)
 LANDMARK_COLOR = (150, 150, 155)
 PATH_COLORS = ((120, 120, 120), (0, 114, 178), (0, 158, 115), (204, 121, 167), (230, 159, 0))
 
-FADE = 0.65  # share of grey in the colour of a location below the threshold
 CELL_PX = 6  # pixels of a floor's cell, so that its edges stay sharp
-MAX_FRUSTA = 1500
-DARK_BACKGROUND = np.full((2, 2, 3), (72, 74, 80), np.uint8)  # low scores are invisible on black
 PICTURE_PX = 360  # width of images in the panel
 DOT_PX = 1.6  # radius of landmarks on images
-MAX_TEXTURE_PX = 2048
 
 _PUNCTUATION = re.compile(r"([!-/:-@\[-`{-~])")  # ASCII punctuation, which CommonMark escapes by a backslash
 
@@ -49,7 +44,7 @@ def escape_markdown(text: str) -> str:
 
 @cache
 def _colormap() -> Any:
-    return colormaps["cividis"].with_extremes(bad=f"#{bytes(UNKNOWN).hex()}")
+    return colormaps["cividis"].with_extremes(bad="#787878")
 
 
 def path_color(number: int) -> tuple[int, int, int]:
@@ -58,7 +53,7 @@ def path_color(number: int) -> tuple[int, int, int]:
 
 
 def score_colors(values: Float, low: float = 0.0, high: float = 1.0) -> Rgb:
-    """Map values between low and high to colours (..., 3); NaN to `UNKNOWN`."""
+    """Map values between low and high to colours (..., 3); NaN to grey."""
     colors = _colormap()((values - low) / max(high - low, 1e-12), bytes=True)
     return np.array(colors, dtype=np.uint8)[..., :3]
 
@@ -92,7 +87,7 @@ def floor_image(raster: Float, low: float, high: float, threshold: float | None)
     if threshold is not None:
         below = known & (raster < threshold)
         grey = colors[below].mean(axis=1, keepdims=True) * 0.5 + 90
-        colors[below] = FADE * grey + (1 - FADE) * colors[below]
+        colors[below] = 0.65 * grey + 0.35 * colors[below]
     image = np.dstack([colors, np.where(known, 235, 0)]).astype(np.uint8)
     return image.repeat(CELL_PX, axis=0).repeat(CELL_PX, axis=1)
 
@@ -115,10 +110,10 @@ def sphere_glb(directions: Float, scores: Float, low: float, high: float, radius
 
 
 def mesh_glb(mesh: TexturedMesh, cut_m: float | None) -> bytes:
-    """Return the mesh below a height as GLB, its textures scaled down to MAX_TEXTURE_PX."""
+    """Return the mesh below a height as GLB, its textures scaled down to 2048 px."""
     textures = [Image.fromarray(texture) for texture in mesh.textures]
     for texture in textures:
-        texture.thumbnail((MAX_TEXTURE_PX, MAX_TEXTURE_PX))
+        texture.thumbnail((2048, 2048))
     small = replace(mesh, textures=tuple(map(np.asarray, textures)))
     return glb_bytes(small if cut_m is None else cut_above(small, cut_m), 80)
 
@@ -141,9 +136,9 @@ def frustum_segments(camera: Camera, cam_from_world: ArrayLike, depth_m: float) 
 
 
 def frusta(camera: Camera, cam_from_world: Float, depth_m: float) -> Float:
-    """Return the edges (S, 2, 3) m of at most MAX_FRUSTA camera frusta, evenly chosen."""
+    """Return the edges (S, 2, 3) m of at most 1500 camera frusta, evenly chosen."""
     n = len(cam_from_world)
-    rows = np.unique(np.linspace(0, n - 1, min(n, MAX_FRUSTA)).astype(int))
+    rows = np.unique(np.linspace(0, n - 1, min(n, 1500)).astype(int))
     return frustum_segments(camera, cam_from_world[rows], depth_m).reshape(-1, 2, 3)
 
 

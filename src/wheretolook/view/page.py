@@ -385,7 +385,8 @@ class Page(Session):
 
     def set_theme(self, dark: bool) -> None:
         """Switch between light and dark."""
-        self.scene.set_background_image(drawing.DARK_BACKGROUND if dark else None, format="png")
+        grey = np.full((2, 2, 3), (72, 74, 80), np.uint8)  # low scores are invisible on black
+        self.scene.set_background_image(grey if dark else None, format="png")
         self.client.gui.configure_theme(dark_mode=dark, show_logo=False, show_share_button=False, control_width="large")
 
     def _method_changed(self) -> None:

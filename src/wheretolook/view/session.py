@@ -30,20 +30,12 @@ SOON = 1
 LATER = 2
 """Urgencies: a view turned by hand, a clicked location, the floor."""
 
-QUIET_S = 0.4
-PATIENCE_S = 4.0
-"""A LATER job does not start within QUIET_S of a NOW job, since the next one would wait for its step, unless no LATER
-job has run for PATIENCE_S."""
+PATIENCE_S = 4.0  # a LATER job precedes others if none has run for this long
 
 CLICK_PATIENCE_S = 1.0  # a SOON job precedes NOW jobs if none has run for this long
 
-HINT = "Click a location on the coloured floor for the score of every direction and the best views."
 LIMITS = {threshold_label(threshold_key(limits)): limits for limits in THRESHOLDS}
 STEP_M = 0.05  # of heights
-_BLANK = np.full((270, 360, 3), (38, 40, 46), np.uint8)
-
-NOTICE_S = 0.5  # minimum time between two error notifications
-
 _log = logging.getLogger(__name__)
 
 
@@ -106,7 +98,8 @@ class Worker:
                 if self._stopped:
                     return
                 job = self._next_job()
-                start = min(self._last_run[NOW] + QUIET_S, self._last_run[LATER] + PATIENCE_S)
+                # not within 0.4 s of a NOW job, since the next one would wait for the step
+                start = min(self._last_run[NOW] + 0.4, self._last_run[LATER] + PATIENCE_S)
                 pause_s = start - time.monotonic()
                 if job.urgency == LATER and pause_s > 0:
                     self._changed.wait(pause_s)
@@ -181,14 +174,16 @@ class Controls:
         self.paths = gui.add_markdown(f"Paths: {', '.join(names)}", visible=bool(names))
 
     def _add_location(self, gui: Any, state: ViewState) -> None:
-        self.summary = gui.add_markdown(HINT)
+        self.summary = gui.add_markdown(
+            "Click a location on the coloured floor for the score of every direction and the best views."
+        )
         self.n = gui.add_slider("best views", 1, MAX_VIEWS, 1, state.n)
         self.view = gui.add_slider("selected view", 1, max(2, state.n), 1, 1)
         self.yaw = gui.add_slider("yaw, degrees", -180.0, 180.0, 0.5, 0.0)
         self.pitch = gui.add_slider("pitch, degrees", -90.0, 90.0, 0.5, 0.0)
         hint = "Move to the selected view; drag to turn it."
         self.inside = gui.add_checkbox("first person", False, hint=hint)
-        self.picture = gui.add_image(_BLANK, visible=False)
+        self.picture = gui.add_image(np.full((270, 360, 3), (38, 40, 46), np.uint8), visible=False)
         self.picture_legend = gui.add_html(
             drawing.legend(0, 1, "probability that a landmark is detected"), visible=False
         )
@@ -255,7 +250,7 @@ class Session:
         self.closed = False
         self._lock = threading.Lock()
         self._inbox = Worker(f"client {client.client_id}")
-        self._notified = -NOTICE_S  # time of the last error notification
+        self._notified = -math.inf  # time of the last error notification
 
     @property
     def selector(self) -> WhereToLook:
@@ -308,9 +303,9 @@ class Session:
             self.worker.submit(self.client.client_id, kind, urgency, steps, self.show_error)
 
     def show_error(self, error: Exception) -> None:
-        """Notify the client of an error, at most once every NOTICE_S."""
+        """Notify the client of an error, at most once every half second."""
         now = time.monotonic()
-        if self.closed or now - self._notified < NOTICE_S:
+        if self.closed or now - self._notified < 0.5:
             return
         self._notified = now
         text = str(error)

@@ -22,8 +22,6 @@ MAX_VIEWS = 20
 MAX_NUMBER = 1e9
 _STATE_FIX = "Copy it from the field `state` of the viewer, such as n=3;height=1.4;place=1,2,1.5."
 
-MAX_POSES = 5000
-MAX_METHODS = 20
 _PATH_FIX = """\
 Give the folder or path.csv of `wheretolook plan`, a scene's folder in results/paths of `wheretolook compare-paths`, a
 TUM trajectory (t x y z qx qy qz qw, camera-to-world), or a CSV of selected views."""
@@ -124,13 +122,13 @@ def read_paths(path: Path, pair: int = 0, world_from_map: Similarity = IDENTITY.
         paths = _compared_paths(path, pair)
     else:
         paths = {"planned" if path.name == "path.csv" else path.stem: Views.read(path)}
-    if not 1 <= len(paths) <= MAX_METHODS:
-        problem = f"1 to {MAX_METHODS} methods can be shown"
+    if not 1 <= len(paths) <= 20:
+        problem = "1 to 20 methods can be shown"
         raise TableError(problem, path=path, value=len(paths), fix="Correct --pair, or leave out methods.")
     for along in paths.values():
         finite = (np.abs(along.cam_from_world) < MAX_NUMBER).all()  # False for NaN
-        if not 2 <= len(along) <= MAX_POSES or not finite:
-            raise TableError(f"a path has 2 to {MAX_POSES} finite poses", path=path, value=len(along), fix=_PATH_FIX)
+        if not 2 <= len(along) <= 5000 or not finite:
+            raise TableError("a path has 2 to 5000 finite poses", path=path, value=len(along), fix=_PATH_FIX)
     place = world_from_map.apply_to_poses
     paths = {name: replace(along, cam_from_world=place(along.cam_from_world)) for name, along in paths.items()}
     if len(paths) == 1:

@@ -160,10 +160,6 @@ class FrustumCounter:
             raise ConfigError("too many locations at once", value=len(at), fix=f"Give at most {most}, or use survey.")
         counts: Any = wp.zeros((len(at), len(self.rotations)), dtype=wp.int32, device=self.device)
         landmarks, _ = self._sorted(at, points, unoccluded)
-        return self._count_sorted(landmarks, counts)
-
-    def _count_sorted(self, landmarks: Any, counts: Any) -> Any:
-        """Add what is in view to counts (L, D) of zeros, by landmarks sorted into cells."""
         if self._field is not None:
             return self._count_by_field(landmarks, counts)
         inputs = [self._sides, landmarks, self._rounding, wp.float64(MIN_DEPTH_M), self.lanes]
@@ -341,7 +337,7 @@ class FrustumLister(FrustumCounter):
 class Survey:
     """What L locations see in D directions."""
 
-    counts: NDArray[np.int32]  # (L, D) landmarks in view, or what another counter counts
+    counts: NDArray[np.int32]  # (L, D) landmarks in view
     best: NDArray[np.int32]  # (L, K) the K directions that see most: by falling count, then by rising direction
     occlusion: StoredOcclusion | None  # landmarks with a free line of sight from each location, if kept
 
@@ -356,7 +352,6 @@ class SurveyOptions:
     threads: int = 0  # on a CPU; 0 for all cores
     memory_bytes: int = 2 << 30  # bound on the memory that counting takes on the device
     progress: str | None = None  # text of the progress bar; None shows none
-    counter: type[FrustumCounter] = FrustumCounter  # what is counted
 
 
 def survey(
@@ -389,7 +384,7 @@ def survey(
     workers = 1 if on_gpu or occlusion.uses_all_cores else (options.threads or cores())
     scratch = max(1, options.memory_bytes // (4 * workers))
     directions = np.asarray(rotations, dtype=np.float64).tobytes()
-    counter = _counter(options.counter, camera, directions, n_points, landmarks.device, scratch)  # type: ignore[arg-type]
+    counter = _counter(camera, directions, n_points, landmarks.device, scratch)
     n_directions = len(counter.rotations)
     _check_counts(len(at), n_directions)
     workers, block = _workers_and_block(counter, len(at), n_points, workers, options.memory_bytes, occlusion)
@@ -422,13 +417,10 @@ def survey(
 
 
 @lru_cache(maxsize=2)
-def _counter(
-    kind: Any, camera: Camera, rotations: bytes, n_points: int, device: str, scratch_bytes: int
-) -> FrustumCounter:
+def _counter(camera: Camera, rotations: bytes, n_points: int, device: str, scratch_bytes: int) -> FrustumCounter:
     """The counter for rotations (D, 3, 3) of float64, kept for the next survey of the same directions."""
     axes = np.frombuffer(rotations).reshape(-1, 3, 3)
-    counter: FrustumCounter = kind(camera, axes, n_points, device, scratch_bytes=scratch_bytes)
-    return counter
+    return FrustumCounter(camera, axes, n_points, device, scratch_bytes=scratch_bytes)
 
 
 def _check_counts(n_locations: int, n_directions: int) -> None:

@@ -16,25 +16,6 @@ if TYPE_CHECKING:
     from wheretolook.dataset.layout import Dataset
 
 
-@dataclass(frozen=True)
-class FiguresConfig:
-    """Options of the figures stage.
-
-    Args:
-        out: output folder; `<dataset>/results/figures` by default.
-        only: names of the figures and tables to draw, as listed by `wheretolook figures --list`; all by default.
-        kinds: file formats of figures: png, pdf, svg.
-    """
-
-    out: Path | None = None
-    only: tuple[str, ...] = ()
-    kinds: tuple[str, ...] = ("png", "pdf")
-
-    def __post_init__(self) -> None:
-        if not self.kinds or not set(self.kinds) <= set(KINDS):
-            raise ConfigError("unknown kind of figure", value=self.kinds, fix=f"Use some of {', '.join(KINDS)}.")
-
-
 @dataclass(frozen=True, kw_only=True)
 class Figures(DatasetOptions):
     """Draw every figure and table of the paper, and others, from logged runs.
@@ -48,24 +29,32 @@ class Figures(DatasetOptions):
       wheretolook figures --only '[top_n, runtimes]' --kinds '[svg]'
 
     Args:
-        figures: which figures, and where and as what they are written.
+        out: output folder; `<dataset>/results/figures` by default.
+        only: names of the figures and tables to draw, as listed by `wheretolook figures --list`; all by default.
+        kinds: file formats of figures: png, pdf, svg.
         tracking: where MLflow keeps its runs.
         list: only list the figures and tables.
     """
 
     CONFIG: ClassVar = "release"
-    GROUPS: ClassVar = {"figures": ""}
     LISTING: ClassVar = "list"
 
-    figures: FiguresConfig = field(default_factory=FiguresConfig)
+    out: Path | None = None
+    only: tuple[str, ...] = ()
+    kinds: tuple[str, ...] = ("png", "pdf")
     tracking: TrackingConfig = field(default_factory=TrackingConfig)
     list: bool = False
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.kinds or not set(self.kinds) <= set(KINDS):
+            raise ConfigError("unknown kind of figure", value=self.kinds, fix=f"Use some of {', '.join(KINDS)}.")
 
     def run(self, log: Log = print) -> Dataset | None:
         """Draw every figure and table from logged runs; those of a release are logged first. Or list them.
 
         Raises:
-            MissingRunError: a figure of the paper, or one named in `figures.only`, has no run to be drawn from. All
+            MissingRunError: a figure of the paper, or one named in `only`, has no run to be drawn from. All
                 others were drawn.
             ConfigError: there is no figure of that name. TableError: there is no dataset.
         """
@@ -84,13 +73,12 @@ class Figures(DatasetOptions):
         from wheretolook_paper.release.catalog import ITEMS, check_names, write_items
         from wheretolook_paper.release.copy import is_release
 
-        config = self.figures
-        check_names(config.only)
+        check_names(self.only)
         if is_release(dataset):
             log_release(dataset, self.tracking, log, attach=False)
-        out = config.out or dataset.root / "results" / "figures"
-        missing = write_items(dataset, self.tracking, out, config.only, config.kinds, log)
-        wanted = config.only or [item.name for item in ITEMS if item.paper]
+        out = self.out or dataset.root / "results" / "figures"
+        missing = write_items(dataset, self.tracking, out, self.only, self.kinds, log)
+        wanted = self.only or [item.name for item in ITEMS if item.paper]
         needed = {name: command for name, command in missing.items() if name in wanted}
         if needed:
             fix = "Run " + "; ".join(dict.fromkeys(needed.values()))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,8 @@ import warp as wp
 from wheretolook.geometry.camera import ColmapCamera
 from wheretolook.geometry.pose_information import N_NUMBERS, bearing_numbers
 from wheretolook.geometry.poses import Float, camera_centers
-from wheretolook.utils.devices import run_in_parts
+from wheretolook.utils.devices import in_threads
+from wheretolook.utils.processes import cores
 from wheretolook.utils.warp import start_warp
 from wheretolook.visibility.frustum import (
     PosedViews,
@@ -25,6 +27,17 @@ from wheretolook.visibility.frustum import (
 )
 from wheretolook_paper.fisher import exact_kernel
 from wheretolook_paper.fisher.exact_kernel import information_kernel
+
+
+def run_in_parts(n_rows: int, rows_at_once: int, work: Callable[[slice], None], device: str = "cpu") -> None:
+    """Call `work` with slices of at most `rows_at_once` rows that cover `n_rows` rows.
+
+    On the CPU, `work` is called from as many threads as there are cores, unless there is a single slice only. NumPy,
+    PyTorch and Warp release Python's lock while they compute, so that the threads use several cores.
+    """
+    parts = [slice(start, min(start + rows_at_once, n_rows)) for start in range(0, n_rows, rows_at_once)]
+    threads = min(len(parts), cores()) if device == "cpu" else 1
+    list(in_threads(work, parts, threads))
 
 
 def exact_information(views: PosedViews, device: str = "cpu") -> Float:

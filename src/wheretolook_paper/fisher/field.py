@@ -11,9 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from wheretolook.geometry.pose_information import N_NUMBERS, TRACE
 from wheretolook.geometry.poses import Float
-from wheretolook.utils.devices import run_in_parts
 from wheretolook.utils.warp import start_warp
 from wheretolook_paper.fisher import field_kernel
+from wheretolook_paper.fisher.exact import run_in_parts
 from wheretolook_paper.fisher.field_kernel import numbers_kernel, process_kernel, quadratic_kernel, vec16
 from wheretolook_paper.fisher.soft_visibility import GaussianProcessVisibility, QuadraticVisibility, SoftVisibility
 

@@ -10,9 +10,9 @@ from numpy.typing import ArrayLike
 
 from wheretolook.geometry.pose_information import N_NUMBERS, TRACE
 from wheretolook.geometry.poses import Float
-from wheretolook.utils.devices import run_in_parts
 from wheretolook.utils.warp import start_warp
 from wheretolook_paper.fisher import metrics_kernel
+from wheretolook_paper.fisher.exact import run_in_parts
 from wheretolook_paper.fisher.metrics_kernel import eigenvalues_kernel
 
 METRICS = ("mineig", "logdet", "trace")

@@ -91,9 +91,25 @@ class GaussianProcessVisibility(SoftVisibility):
     steepness: float = 15.0  # of the soft step
 
     @classmethod
-    def fitted(cls, half_angle_rad: float, n_factors: int = 70, steepness: float = 15.0) -> GaussianProcessVisibility:
+    @lru_cache
+    def fitted(cls, half_angle_rad: float, n_factors: int = 70) -> GaussianProcessVisibility:
         """Return the process whose length l maximizes the marginal likelihood of the step at the axes, for many bearings."""
-        return _fitted(float(half_angle_rad), n_factors, float(steepness))
+        bearings = np.random.default_rng(0).normal(size=(1000, 3))
+        bearings /= np.linalg.norm(bearings, axis=-1, keepdims=True)
+
+        def negative_log_likelihood(log_length: float) -> float:
+            process = cls(half_angle_rad, float(np.exp(log_length)), n_factors)
+            kernel = process.of_axes(process.axes) + JITTER * np.eye(n_factors)
+            seen = process.step(process.axes @ bearings.T)  # (F, 1000)
+            sign, log_determinant = np.linalg.slogdet(kernel)
+            if sign <= 0:
+                return np.inf
+            # the best variance of the kernel for this length, in closed form
+            variance = float(np.mean(seen * np.linalg.solve(kernel, seen)))
+            return float(np.inf if variance <= 0 else n_factors * np.log(variance) + log_determinant)
+
+        found = minimize_scalar(negative_log_likelihood, bounds=np.log([0.05, 1.2]), method="bounded")
+        return cls(half_angle_rad, float(np.exp(found.x)), n_factors)
 
     @cached_property
     def axes(self) -> Float:
@@ -121,33 +137,6 @@ class GaussianProcessVisibility(SoftVisibility):
         """Return s(c) of cosines between axis and bearing."""
         return np.asarray(0.5 * (1 + np.tanh(0.5 * self.steepness * (cosines - np.cos(self.half_angle_rad)))))
 
-    def held_out_error(self) -> float:
-        """Return the root mean square of v(z, f) - s(z . f) over random bearings and axes not used in the fit."""
-        rng = np.random.default_rng(1)
-        bearings, axes = (_unit(rng.normal(size=(1000, 3))) for _ in range(2))
-        predicted = self.of_axes(axes) @ self.finish(self.of_bearings(bearings).T)
-        return float(np.sqrt(np.mean((predicted - self.step(axes @ bearings.T)) ** 2)))
-
-
-@lru_cache
-def _fitted(half_angle_rad: float, n_factors: int, steepness: float) -> GaussianProcessVisibility:
-
-    bearings = _unit(np.random.default_rng(0).normal(size=(1000, 3)))
-
-    def negative_log_likelihood(log_length: float) -> float:
-        process = GaussianProcessVisibility(half_angle_rad, float(np.exp(log_length)), n_factors, steepness)
-        kernel = process.of_axes(process.axes) + JITTER * np.eye(n_factors)
-        seen = process.step(process.axes @ bearings.T)  # (F, 1000)
-        sign, log_determinant = np.linalg.slogdet(kernel)
-        if sign <= 0:
-            return np.inf
-        # the best variance of the kernel for this length, in closed form
-        variance = float(np.mean(seen * np.linalg.solve(kernel, seen)))
-        return float(np.inf if variance <= 0 else n_factors * np.log(variance) + log_determinant)
-
-    found = minimize_scalar(negative_log_likelihood, bounds=np.log([0.05, 1.2]), method="bounded")
-    return GaussianProcessVisibility(half_angle_rad, float(np.exp(found.x)), n_factors, steepness)
-
 
 def cone_half_angle(camera: Camera) -> float:
     """Return half the opening angle in radians of the cone with the solid angle of a camera's field of view."""
@@ -160,7 +149,3 @@ def cone_half_angle(camera: Camera) -> float:
     # the image's four quarters about the principal point
     solid_angle = np.sum(np.arcsin(a * b / np.sqrt((1 + a * a) * (1 + b * b))))
     return float(np.arccos(1 - solid_angle / (2 * np.pi)))
-
-
-def _unit(vectors: Float) -> Float:
-    return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))

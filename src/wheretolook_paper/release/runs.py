@@ -31,6 +31,7 @@ from wheretolook.tracking import (
     Tags,
     TrackingConfig,
     artifact,
+    client as client_of,
     experiment_ids,
     finished_runs,
     joined,
@@ -38,7 +39,6 @@ from wheretolook.tracking import (
     log_history,
     start_run,
 )
-from wheretolook.tracking import client as client_of
 from wheretolook.training.provenance import HISTORY_CSV, kept_metrics, params_of
 from wheretolook.utils.files import copy_file, temporary_folder, write_text
 from wheretolook.utils.processes import hold

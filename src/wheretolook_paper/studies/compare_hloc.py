@@ -48,7 +48,6 @@ from wheretolook.dataset.scene import Scene
 from wheretolook.dataset.viewpoint_table import poses as poses_of_table
 from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.evaluation.scoring import score_scenes
-from wheretolook.evaluation.statistics import precision_area, precision_over_coverage
 from wheretolook.features.extractor import KINDS, ExtractorConfig, KeypointExtractor, Keypoints, kind_of
 from wheretolook.figures.floor_plan import save_figure
 from wheretolook.geometry.camera import Camera, camera_of, write_cameras
@@ -71,6 +70,7 @@ from wheretolook.utils.devices import usable_device
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.files import atomic_write, write_bytes, write_text
 from wheretolook.utils.processes import WorkerPool
+from wheretolook_paper.relocalization import precision_area, precision_over_coverage
 
 MATCHERS = {"aliked": "aliked+lightglue", "disk": "disk+lightglue", "opencv": "NN-ratio"}  # of hloc, by extractor
 LABELS = {"aliked": "ALIKED", "disk": "DISK", "opencv": "SIFT"}

@@ -64,7 +64,7 @@ TABLES = {
 TABLE_SIZE = 1200, 620
 PLOT_SIZE = 1075, 575
 SCATTER_SIZE = 1075, 610
-VIEWER_SIZE = 1400, 960
+VIEWER_SIZE = 1700, 960  # wide enough that the panel at the right leaves the scene in the middle free
 LOAD_S = 180  # until a page is complete
 LEFT, TOP = 206, 14
 """Where the pages of MLflow begin, right of its menu."""
@@ -172,7 +172,9 @@ def draw_viewer(profile: Path) -> None:
                 tab.wait(lambda tab: re.search(done, tab.text) is not None, 4 * LOAD_S)  # scores the floor
                 time.sleep(2)
                 tab.evaluate("document.querySelectorAll('.mantine-Notification-root').forEach(e => e.remove())")
-                tab.save(Path("docs/images/viewer.webp"), 0, 0, *VIEWER_SIZE)
+                width, height = VIEWER_SIZE
+                margin = 340  # left of the scene
+                tab.save(Path("docs/images/viewer.webp"), margin, 0, width - margin, height)
         finally:
             server.terminate()
 

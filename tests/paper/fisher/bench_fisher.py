@@ -52,8 +52,16 @@ def main():
             reached.append(f"{metric} {100 * share.mean():.1f}")
         about = "quadratic" if isinstance(visibility, QuadraticVisibility) else ""
         if isinstance(visibility, GaussianProcessVisibility):
-            about = f"{visibility.length:6.3f}  {visibility.held_out_error():13.4f}"
+            about = f"{visibility.length:6.3f}  {held_out_error(visibility):13.4f}"
         print(f"{visibility.n_factors:7}  {about:21}  {np.median(error):19.3f}  {', '.join(reached)}", flush=True)
+
+
+def held_out_error(visibility):
+    """Root mean square of v(z, f) - s(z . f) over random bearings and axes not used in the fit."""
+    vectors = np.random.default_rng(1).normal(size=(2, 1000, 3))
+    bearings, axes = vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+    predicted = visibility.of_axes(axes) @ visibility.finish(visibility.of_bearings(bearings).T)
+    return float(np.sqrt(np.mean((predicted - visibility.step(axes @ bearings.T)) ** 2)))
 
 
 if __name__ == "__main__":

@@ -17,8 +17,7 @@ from synthetic_dataset import CAMERA, make_dataset
 from wheretolook.cli import parse_command
 from wheretolook.commands.evaluate import Evaluate
 from wheretolook.commands.options import ScenesConfig
-from wheretolook.commands.train import Train
-from wheretolook.commands.train import train_methods as train
+from wheretolook.commands.train import Train, train_methods as train
 from wheretolook.dataset.config import RELEASE, RELEASE_FILE
 from wheretolook.dataset.layout import Dataset
 from wheretolook.dataset.viewpoint_table import poses

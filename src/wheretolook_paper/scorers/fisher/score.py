@@ -104,8 +104,6 @@ class FisherScorer(Scorer):
     rows of the paper's table on the validation scene.
     """
 
-    local = True
-
     def __init__(
         self,
         localization_map: LocalizationMap,
@@ -130,8 +128,6 @@ class FisherScorer(Scorer):
 
 class ProbeScorer(Scorer):
     """Scores a view by the angle between its axis and a certain axis of its location."""
-
-    local = True
 
     def __init__(self, localization_map: LocalizationMap) -> None:
         super().__init__(localization_map)

@@ -189,7 +189,6 @@ class TreesScorer(LandmarkScorer):
     """Probability that a view localizes, by boosted trees on the positions and attributes of its visible landmarks."""
 
     name = "trees"
-    local = True
 
     def __init__(self, localization_map: LocalizationMap, trees: BoostedTrees) -> None:
         super().__init__(localization_map, ATTRIBUTES, trees.training_range, trees.camera)

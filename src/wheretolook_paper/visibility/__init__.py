@@ -1,1 +1,0 @@
-"""Visibility as the paper's released code counts it."""

@@ -51,8 +51,8 @@ class MappedSpace:
         Both ends must be free, no landmark may be closer to the segment than the clearance, and the segment must stay
         near mapping cameras (tested every 2 cm).
         """
-        ends = (np.asarray(points, dtype=np.float64).reshape(-1, 3) for points in (a, b))
-        start, end = np.broadcast_arrays(*ends)
+        start, end = (np.asarray(points, dtype=np.float64).reshape(-1, 3) for points in (a, b))
+        start, end = np.broadcast_arrays(start, end)
         free = self.is_free(start) & self.is_free(end)
         for n in np.flatnonzero(free):
             free[n] = self._is_clear(start[n], end[n]) and self._stays_near_cameras(start[n], end[n])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -150,22 +150,13 @@ def draw_overview(options: Demo, weights: Path) -> None:
     save_figure(overview_figure(drawn), options.root / "results" / OVERVIEW)
 
 
-@dataclass(frozen=True)
-class LookConfig:
-    """Compared numbers of views and strategies, noise of the rotations between views, and the seed."""
-
-    numbers: tuple[int, ...] = NUMBERS
-    strategies: tuple[str, ...] = tuple(STRATEGIES)
-    turn_noise_deg: float = 0.0
-    seed: int = 0
-
-
 def evaluate_look_sets(
     dataset: Dataset,
     evaluate: EvaluateConfig,
     tracking: TrackingConfig,
     device: str,
-    config: LookConfig = LookConfig(),
+    numbers: Sequence[int] = NUMBERS,
+    strategies: Sequence[str] = tuple(STRATEGIES),
     progress: bool = True,
 ) -> pd.DataFrame | None:
     """Compare view sets in a split's labelled scenes; write `looks.csv` and `looks.md` next to its scores, log a run.
@@ -185,19 +176,22 @@ def evaluate_look_sets(
         return None
     maps = [scene.localization_map(device=device) for scene in scenes]
     results = [
-        compare_looks(scene, load_scorer(one, str(weights), evaluate.anywhere), config, progress)
+        compare_looks(scene, load_scorer(one, str(weights), evaluate.anywhere), numbers, strategies, progress)
         for scene, one in zip(scenes, maps, strict=True)
     ]
     sets = pd.concat(results, ignore_index=True)
     folder = results_folder(dataset, evaluate)
     table = write_looks(folder, sets, f"Looks localized together on {dataset.name}, {evaluate.split} scenes")
-    params = {"dataset": dataset.name, "split": evaluate.split, "weights": weights.name, **asdict(config)}
+    params = {"dataset": dataset.name, "split": evaluate.split, "weights": weights.name}
+    params |= {"numbers": numbers, "strategies": strategies}
     with kept_if_not_logged(f"the comparison of looks in {folder}"):
         log_looks(tracking, table, params, [folder / name for name in (LOOKS_CSV, LOOKS_MD)])
     return table
 
 
-def compare_looks(scene: SceneFolder, scorer: Scorer, config: LookConfig, progress: bool) -> pd.DataFrame:
+def compare_looks(
+    scene: SceneFolder, scorer: Scorer, numbers: Sequence[int], strategies: Sequence[str], progress: bool
+) -> pd.DataFrame:
     """Choose sets of views by every strategy at every labelled location of a scene, and localize them jointly.
 
     Returns the columns of `label_sets` for each set, with `strategy`, `expected` (its predicted score), `single_good`
@@ -209,7 +203,7 @@ def compare_looks(scene: SceneFolder, scorer: Scorer, config: LookConfig, progre
     cam_from_world = poses(table)
     good = is_good(table)
     scores = scorer.score(cam_from_world)
-    rng = np.random.default_rng(config.seed)
+    rng = np.random.default_rng(0)
     set_score = SetScoreModel.bundled()
     sets: list[list[int]] = []
     about: list[dict[str, Any]] = []
@@ -218,8 +212,8 @@ def compare_looks(scene: SceneFolder, scorer: Scorer, config: LookConfig, progre
         values = scores[rows]
         center = -cam_from_world[rows[0], :, :3].T @ cam_from_world[rows[0], :, 3]
         views, certain = (candidate_views(scorer, center, axes, values, certain) for certain in (False, True))
-        for strategy in config.strategies:
-            for n in config.numbers:
+        for strategy in strategies:
+            for n in numbers:
                 if n > len(rows):
                     continue
                 looks = choose_set(strategy, n, axes, values, views, certain, rng)
@@ -233,7 +227,5 @@ def compare_looks(scene: SceneFolder, scorer: Scorer, config: LookConfig, progre
                 )
     points = scene.localization_map().landmarks.points
     text = f"looks {scene.name}" if progress else None
-    labelled = label_sets(
-        table, sets, points, scene.camera, turn_noise_deg=config.turn_noise_deg, seed=config.seed, progress=text
-    )
+    labelled = label_sets(table, sets, points, scene.camera, progress=text)
     return pd.concat([pd.DataFrame(about), labelled], axis=1).assign(good=is_good(labelled))

@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 from tqdm.auto import tqdm
 
 from wheretolook.dataset.viewpoint_files import MATCH_FIELDS
@@ -53,7 +52,7 @@ TOGETHER = "together"
 """The product's strategy."""
 
 
-def look_table(sets: pd.DataFrame, resamples: int = 2000, seed: int = 0) -> pd.DataFrame:
+def look_table(sets: pd.DataFrame) -> pd.DataFrame:
     """Return the share of locations whose sets localize jointly, by strategy and number of views.
 
     Columns: `good` and its 95 % interval by resampling locations; `gain` over the best single view of the same
@@ -64,7 +63,7 @@ def look_table(sets: pd.DataFrame, resamples: int = 2000, seed: int = 0) -> pd.D
     for (strategy, n), part in sets.groupby(["strategy", "n_looks"], sort=False):
         good = part["good"].to_numpy(float)
         values = np.stack([good, good - part["single_good"].to_numpy(float)], axis=1)
-        bootstrap = ClusterBootstrap(np.arange(len(part)), resamples, seed)
+        bootstrap = ClusterBootstrap(np.arange(len(part)), 2000, 0)
         low, high = bootstrap.ratio_interval(values, np.ones((len(part), 1)))
         mean = values.mean(0)
         sure = part["confidence"] >= 0.99
@@ -157,10 +156,10 @@ def count_score(sums: Float, p_none: Float) -> Float:
     return np.asarray(sums)[..., 0]
 
 
-def best_separated(scores: Float, directions: Float, n: int, separation_deg: float = 40.0) -> list[int]:
-    """Return the n views with the best single-view scores (D,), separated by an angle if there are as many."""
+def best_separated(scores: Float, directions: Float, n: int) -> list[int]:
+    """Return the n views with the best single-view scores (D,), 40 degrees apart if there are as many."""
     order = np.argsort(-np.asarray(scores), kind="stable").tolist()
-    near = np.cos(np.radians(separation_deg))
+    near = np.cos(np.radians(40.0))
     views: list[int] = []
     for view in order:
         if all(directions[view] @ directions[other] <= near for other in views):
@@ -224,40 +223,37 @@ def label_sets(
     points: Float,
     cameras: Camera | Mapping[int, Camera],
     config: LocalizerConfig = LocalizerConfig(),
-    turn_noise_deg: float = 0.0,
-    seed: int = 0,
     progress: str | None = None,
     rigs: Sequence[Float] | None = None,
 ) -> pd.DataFrame:
     """Localize sets of a table's views jointly and measure the errors.
 
-    A set has rows of the table with views of one location, whose relative rotations are those of the table, with
-    `turn_noise_deg` of noise about each axis drawn from the seed; its error is that of the worst view. With `rigs`,
+    A set has rows of the table with views of one location, whose relative rotations are those of the table; its error
+    is that of the worst view. With `rigs`,
     cam_from_rig (N, 3, 4) in metres for each set, its views may be of several locations; its error is that of its
     first view. `points` (N, 3) m are the landmarks. A set of one view gets the label of a single image, up to the order
     of its matches. `progress` is the title of a progress bar. Returns a row per set, with `SET_COLUMNS`.
 
     Raises TableError if the table has no stored pixels or a row is invalid, PoseError if views of a set are not from
-    one location, ConfigError for negative noise.
+    one location.
     """
     missing = [name for name in (*MATCH_FIELDS.names[:1], PIXELS) if name not in table]
     if missing:
         fix = "Label with `--label.store_pixels true`, and read the table with `pixels=True`."
         raise TableError("the table has no pixels of matches", value=missing, fix=fix)
-    localizer = JointLocalizer(PoseEstimator(points, config), turn_noise_deg)
-    rng = np.random.default_rng(seed)
+    localizer = JointLocalizer(PoseEstimator(points, config))
     true_poses = poses(table)
     locations = table["location_id"].tolist()
     single_view: dict[int, SingleViewPoses] = {}
-    known: dict[tuple[int, ...], tuple[object, ...]] = {}  # repeated sets, if nothing is drawn for each
+    known: dict[tuple[int, ...], tuple[object, ...]] = {}  # repeated sets, if each has no rig of its own
     rows: list[tuple[object, ...]] = []
     for number, members in enumerate(tqdm(sets, desc=progress, unit="set", disable=progress is None)):
         key = tuple(map(int, members))
         if not key or max(key) >= len(table):
             raise TableError(f"a set of views has none or wrong rows of {len(table)}", value=key)
-        if key not in known or turn_noise_deg or rigs is not None:
+        if key not in known or rigs is not None:
             true = true_poses[list(key)]
-            rig = _noisy(rig_of(true), turn_noise_deg, rng) if rigs is None else rigs[number]
+            rig = rig_of(true) if rigs is None else rigs[number]
             looks = [_look(table, row, pose, cameras, len(points)) for row, pose in zip(key, rig, strict=True)]
             start = time.perf_counter()
             for row, look in zip(key, looks, strict=True):
@@ -301,13 +297,3 @@ def _look(
         problem = f"a view matched a landmark that the map of {n_points} lacks"
         raise TableError(problem, value=int(landmarks.max()), fix="Label the scene again with its present map.")
     return Look(cam_from_rig, pixels, landmarks, cameras)
-
-
-def _noisy(cam_from_rig: Float, turn_noise_deg: float, rng: np.random.Generator) -> Float:
-    """Perturb the rotations of all views but the first, which defines the rig."""
-    if turn_noise_deg == 0:
-        return cam_from_rig
-
-    noise = Rotation.from_rotvec(np.radians(rng.normal(0, turn_noise_deg, (len(cam_from_rig), 3)))).as_matrix()
-    noise[0] = np.eye(3)
-    return np.concatenate([noise @ cam_from_rig[:, :, :3], cam_from_rig[:, :, 3:]], axis=2)

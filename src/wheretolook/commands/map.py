@@ -180,8 +180,8 @@ def _map_mesh(options: BuildMap, files: SceneFolder, log: Log) -> None:
     camera = _mapping_camera(config, scene.camera, seed)
     views = [asdict(scene.free_space), camera.record(), seed, made_from, *([floor] if floor else [])]
     cache = files.stage_cache("map", cache_key("map", [config.record(), *views]))
-    model = [files.map / name for name in ("cameras.bin", "images.bin", "points3D.bin")]
-    if cache.is_current(files.landmarks, *model):
+    model = (files.map / "cameras.bin", files.map / "images.bin", files.map / "points3D.bin")
+    if cache.is_current(files.landmarks) and all(path.exists() for path in model):
         log(f"{scene.name}: reusing {files.map}")
         return
     from wheretolook.mapping.rendered_map import PartOfFloor, build_map

@@ -442,5 +442,6 @@ def mesh_fingerprint(path: Path) -> str:
         raise SceneError("there is no such mesh", path=path, fix="Check the path.")
     files = [path]
     if path.is_dir() or path.suffix.lower() != ".glb":  # materials and textures are files next to it
-        files = sorted(file for file in (path if path.is_dir() else path.parent).iterdir() if file.is_file())
+        folder = path if path.is_dir() else path.parent
+        files = sorted(file for file in folder.iterdir() if file.is_file())
     return " ".join(f"{file.resolve()}:{file.stat().st_size}:{file.stat().st_mtime_ns}" for file in files)

@@ -279,16 +279,15 @@ def _share_columns(
         columns["p"] = bootstrap.paired_p(difference)
         expected = [is_random(reference) or is_random(method) for method in tops]
         columns["p"][expected] = np.nan  # the test does not apply to expectations
-    keys = [(prefix, threshold_key(limits)) for prefix in ("", FIRST) for limits in config.thresholds]
-    return {
-        method: {"n_locations": len(good), "n_views": int(chosen.sum())}
-        | {
-            f"{prefix}{name}_{key}": float(values[row, index])
-            for index, (prefix, key) in enumerate(keys[: good.shape[2]])
-            for name, values in columns.items()
-        }
-        for row, method in enumerate(tops)
-    }
+    keys = [threshold_key(limits) for limits in config.thresholds]
+    ends = [("", key) for key in keys] + [(FIRST, key) for key in keys]
+    rows: dict[str, dict[str, float]] = {}
+    for row, method in enumerate(tops):
+        rows[method] = {"n_locations": len(good), "n_views": int(chosen.sum())}
+        for index, (prefix, key) in enumerate(ends[: good.shape[2]]):
+            for name, values in columns.items():
+                rows[method][f"{prefix}{name}_{key}"] = float(values[row, index])
+    return rows
 
 
 def _ranking_metrics(good: NDArray[np.bool_], scores: Float) -> dict[str, float]:

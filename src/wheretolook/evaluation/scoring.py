@@ -117,7 +117,10 @@ def _fit_temperatures(
     scenes = [scene for scene in dataset.split("val") if has_labels(scene)]
     if not scenes:
         return {}, 0
-    tables = [table[table["status"] != UNLABELLED] for table in (scene.read_table() for scene in scenes)]
+    tables = []
+    for scene in scenes:
+        table = scene.read_table()
+        tables.append(table[table["status"] != UNLABELLED])
     chosen = methods_named(config.methods, scorers())
     config = replace(config, methods=tuple(method.name for method in chosen if method.probability), reference="")
     scores, _ = score_scenes(scenes, tables, config, weights, device, progress, occlusion)

@@ -174,11 +174,12 @@ def check_ends(ends: Float, space: Space, bounds: Float, map_from_world: Similar
         if not ((point >= low) & (point <= high)).all() or not space.is_free(point[None])[0]:
             there = low + (high - low) * np.random.default_rng(0).random((4096, 3))
             free = there[space.is_free(there)]
-            near = free[np.linalg.norm(free - point, axis=1).argsort()[:1]]
-            shown = ",".join(f"{value:.2f}" for value in map_from_world.apply(near[0])) if len(near) else ""
-            fix = f"Give a point where the camera can be{', such as ' * bool(shown)}{shown}."
+            fix = "Give a point where the camera can be"
+            if len(free):
+                near = map_from_world.apply(free[np.linalg.norm(free - point, axis=1).argmin()])
+                fix += f", such as {near[0]:.2f},{near[1]:.2f},{near[2]:.2f}"
             value = tuple(map_from_world.apply(point).round(6).tolist())
-            raise PlanningError(f"the {name} is not in free space", value=value, fix=fix)
+            raise PlanningError(f"the {name} is not in free space", value=value, fix=f"{fix}.")
     if np.linalg.norm(ends[1] - ends[0]) < 1e-6:
         raise PlanningError("the start is the goal", value=tuple(map_from_world.apply(ends[0]).tolist()))
 
@@ -241,13 +242,14 @@ def improve(
 def propose_route_change(route: Float, bounds: Float, rng: np.random.Generator) -> tuple[Float, int, int]:
     """Draw a variation of a route (S, 3) m; returns it, and the first and last corner between which it differs."""
     n = len(route)
+    low, high = bounds
     step = np.exp(rng.uniform(*np.log((0.05, 1.0))))  # standard deviation, metres
     kind = rng.integers(4) if n > 2 else rng.integers(2)
     if kind == 0:  # a new corner near a random point of the route
         after = int(rng.integers(1, n))
         t = rng.random()
         new = route[after - 1] * (1 - t) + route[after] * t + rng.normal(0, step, 3)
-        return np.insert(route, after, new.clip(*bounds), axis=0), after - 1, after + 1
+        return np.insert(route, after, new.clip(low, high), axis=0), after - 1, after + 1
     if kind == 1:  # a shortcut between two random points of the route
         at = lengths_along(route)
         a, b = np.sort(rng.uniform(0, at[-1], 2))
@@ -259,7 +261,7 @@ def propose_route_change(route: Float, bounds: Float, rng: np.random.Generator) 
     if kind == 2:  # remove a corner
         return np.delete(route, row, axis=0), row - 1, row
     moved = route.copy()
-    moved[row] = (moved[row] + rng.normal(0, step, 3)).clip(*bounds)
+    moved[row] = (moved[row] + rng.normal(0, step, 3)).clip(low, high)
     return moved, row - 1, row + 1
 
 

@@ -242,8 +242,8 @@ class RobotScorer:
         rotation = rotations[first] @ self._rotation
         pose = np.concatenate([rotation, -rotation @ at[:, None]], axis=1)
         quaternion = quaternion_xyzw(rotation.T)
-        report = (getattr(views, field.name)[first].item() for field in fields(ScoredViews))
-        return BestView(pose[2, :3], pose, quaternion, *report)
+        report = {field.name: getattr(views, field.name)[first].item() for field in fields(ScoredViews)}
+        return BestView(pose[2, :3], pose, quaternion, **report)
 
     def _to_world(self, points: Array) -> Array:
         """Transform points (..., 3) of the map to the world."""

@@ -26,8 +26,8 @@ from wheretolook.mapping.map_frame import MapFrame
 from wheretolook.scorers.base import Scorer
 from wheretolook.scorers.registry import make_scorer
 from wheretolook.scorers.weights import resolve_weights
-from wheretolook.select.selection import reported, select_views, with_reasons
-from wheretolook.select.waypoints import SelectionRequest, Waypoints, grid_waypoints, usable_waypoints
+from wheretolook.select.selection import reported, select_views, usable_waypoints, with_reasons
+from wheretolook.select.waypoints import SelectionRequest, Waypoints, grid_waypoints
 from wheretolook.space.mapped_space import MappedSpace
 from wheretolook.training.weights import method_of_weights
 from wheretolook.utils.devices import usable_device

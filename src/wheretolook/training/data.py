@@ -252,8 +252,16 @@ class BinnedBatches(IndexBatches):
 
     numpy_order = True
 
-    def __init__(self, views: LabelledViews, rows: Tensor, channels: tuple[str, ...], *options: Any) -> None:
-        super().__init__(rows.to(views.device), *options)
+    def __init__(
+        self,
+        views: LabelledViews,
+        rows: Tensor,
+        channels: tuple[str, ...],
+        batch_size: int,
+        shuffle_seed: int | None = None,
+        share: tuple[int, int] = (0, 1),
+    ) -> None:
+        super().__init__(rows.to(views.device), batch_size, shuffle_seed, share)
         self.views = views
         self._channels = torch.tensor([views.channels.index(name) for name in channels], device=views.device)
 

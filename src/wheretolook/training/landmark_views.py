@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import log
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -140,11 +139,13 @@ class LandmarkBatches(IndexBatches):
         views: LandmarkViews,
         rows: Tensor,
         width: int,
-        *options: Any,
+        batch_size: int,
+        shuffle_seed: int | None = None,
+        share: tuple[int, int] = (0, 1),
         max_scale: float = 1,
         max_error_m: float = 0.05,
     ) -> None:
-        super().__init__(rows.to(views.device), *options)
+        super().__init__(rows.to(views.device), batch_size, shuffle_seed, share)
         self.views = views
         self.width = width
         self.max_scale = max_scale

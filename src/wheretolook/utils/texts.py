@@ -14,7 +14,7 @@ from wheretolook.utils.errors import LockWarning, MapWarning, OutOfRangeWarning,
 
 def markdown_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """Return a Markdown table whose columns also line up as plain text."""
-    widths = [max(len(line[column]) for line in [header, *rows]) for column in range(len(header))]
+    widths = [max(map(len, column)) for column in zip(header, *rows, strict=True)]
     lines = []
     for line in (header, ["-" * width for width in widths], *rows):
         cells = [cell.ljust(width) for cell, width in zip(line, widths, strict=True)]

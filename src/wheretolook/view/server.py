@@ -64,8 +64,11 @@ class Viewer:
         if port not in (0, self.port):  # taken since the check
             self.stop()
             raise InUseError("this port is in use", value=port, fix=f"Use another: --port {self.port}.")
-        shown_host = "localhost" if host in ("0.0.0.0", "::", "127.0.0.1") else f"[{host}]" if ":" in host else host
-        self.address = f"{shown_host}:{self.port}"
+        if host in ("0.0.0.0", "::", "127.0.0.1"):
+            host = "localhost"
+        elif ":" in host:
+            host = f"[{host}]"
+        self.address = f"{host}:{self.port}"
         self._place_camera()
         self.server.on_client_connect(self._client_joined)
         self.server.on_client_disconnect(self._client_left)

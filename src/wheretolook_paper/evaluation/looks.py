@@ -52,7 +52,7 @@ TOGETHER = "together"
 """The product's strategy."""
 
 
-def look_table(sets: pd.DataFrame, resamples: int = 2000, seed: int = 0) -> pd.DataFrame:
+def look_table(sets: pd.DataFrame) -> pd.DataFrame:
     """Return the share of locations whose sets localize jointly, by strategy and number of views.
 
     Columns: `good` and its 95 % interval by resampling locations; `gain` over the best single view of the same
@@ -63,7 +63,7 @@ def look_table(sets: pd.DataFrame, resamples: int = 2000, seed: int = 0) -> pd.D
     for (strategy, n), part in sets.groupby(["strategy", "n_looks"], sort=False):
         good = part["good"].to_numpy(float)
         values = np.stack([good, good - part["single_good"].to_numpy(float)], axis=1)
-        bootstrap = ClusterBootstrap(np.arange(len(part)), resamples, seed)
+        bootstrap = ClusterBootstrap(np.arange(len(part)), 2000, 0)
         low, high = bootstrap.ratio_interval(values, np.ones((len(part), 1)))
         mean = values.mean(0)
         sure = part["confidence"] >= 0.99
@@ -156,10 +156,10 @@ def count_score(sums: Float, p_none: Float) -> Float:
     return np.asarray(sums)[..., 0]
 
 
-def best_separated(scores: Float, directions: Float, n: int, separation_deg: float = 40.0) -> list[int]:
-    """Return the n views with the best single-view scores (D,), separated by an angle if there are as many."""
+def best_separated(scores: Float, directions: Float, n: int) -> list[int]:
+    """Return the n views with the best single-view scores (D,), 40 degrees apart if there are as many."""
     order = np.argsort(-np.asarray(scores), kind="stable").tolist()
-    near = np.cos(np.radians(separation_deg))
+    near = np.cos(np.radians(40.0))
     views: list[int] = []
     for view in order:
         if all(directions[view] @ directions[other] <= near for other in views):

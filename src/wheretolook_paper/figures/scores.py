@@ -189,7 +189,8 @@ def top_n_figure(scores: pd.DataFrame, methods: Sequence[str] = ()) -> Figure:
     scores = main_rows(scores)
     pooled = scores[scores["scene"] == ALL]
     keys = threshold_keys(scores)
-    shown = _present(pooled, methods) if methods else _the_few(pooled)
+    present = methods_of(pooled)
+    shown = [name for name in methods if name in present] or _the_few(pooled)
     top_n = [int(n) for n in pooled["top_n"].unique()]
     with context(PRINT):
         figure = new_figure(TWO_COLUMNS_IN, 4.6)
@@ -241,15 +242,6 @@ def _the_few(pooled: pd.DataFrame) -> list[str]:
             first.setdefault(known.folder, name)
     order = list(STYLES)
     return sorted(first.values(), key=lambda name: order.index(name.partition(" ")[0]), reverse=True)
-
-
-def _present(pooled: pd.DataFrame, methods: Sequence[str]) -> list[str]:
-    """Return the methods present in a table; a family name stands for its first method there."""
-    first: dict[str, str] = {}
-    for name in methods_of(pooled):
-        known = find(name)
-        first |= {name: name} | ({known.family: name} if known and known.family not in first else {})
-    return list(dict.fromkeys(first[name] for name in methods if name in first))
 
 
 def _draw_numbers(axes: Axes, pooled: pd.DataFrame, methods: Sequence[str], top_n: Sequence[int], column: str) -> None:

@@ -27,6 +27,7 @@ CHANGES = [
     ("cameras", 16, "<Q", 2**40),
     ("cameras", 12, "<i", 99),  # camera model
     *[("cameras", 32, "<d", focal) for focal in (NAN, 0.0, -320.0)],
+    ("cameras", 40, "<d", 1e5),  # principal point
     ("points3D", 8 + 51, "<I", 99),  # image of a track
 ]
 
@@ -40,6 +41,18 @@ def test_corrupt_binary_models_are_rejected_by_file(tmp_path, name, offset, layo
     with pytest.raises(MapError) as caught:
         read_model(path.parent)
     assert caught.value.path == path and caught.value.fix
+
+
+def test_frames_with_images_that_are_missing_are_older_than_the_images(tmp_path):
+    path = written(rig_model(), tmp_path / "model", text=True)
+    with (path / "frames.txt").open("a") as file:
+        file.write("99 1 1 0 0 0 0 0 0 1 CAMERA 1 999\n")
+    expected = written(rig_model(), tmp_path / "expected", text=True)
+    (expected / "frames.txt").unlink()
+    (expected / "rigs.txt").unlink()
+    with pytest.warns(MapWarning, match="frames"):
+        found = read_model(path)
+    np.testing.assert_array_equal(colmap_poses(path, found), colmap_poses(expected, read_model(expected)))
 
 
 @pytest.mark.parametrize(

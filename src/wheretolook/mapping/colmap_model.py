@@ -128,8 +128,12 @@ def check_cameras_and_images(model: Any, folder: Path, suffix: str) -> None:
     for number, camera in model.cameras.items():
         sides = (camera.width, camera.height)
         focal = camera.params[camera.focal_length_idxs()]
-        if not (0 < min(sides) <= max(sides) <= MAX_SIDE_PX and np.isfinite(camera.params).all() and (focal > 0).all()):
-            problem = f"camera {number} needs an image size, finite parameters and a positive focal length"
+        centre = np.abs((camera.principal_point_x, camera.principal_point_y)).max()
+        valid = 0 < min(sides) <= max(sides) <= MAX_SIDE_PX and np.isfinite(camera.params).all() and (focal > 0).all()
+        if not valid or centre > 10 * max(sides):
+            problem = (
+                f"camera {number} needs an image size, finite parameters, a positive focal length, and its centre near"
+            )
             raise MapError(problem, path=path, value=(*sides, *camera.params), fix="Correct the camera.")
     for number, image in model.images.items():
         _ = image.name  # raises UnicodeDecodeError if it is not in UTF-8
@@ -290,7 +294,8 @@ def _read_files(folder: Path, suffix: str) -> Any:
         numbers = (model.num_cameras(), model.num_images(), model.num_points3D())
         for name, number in zip(MODEL_FILES, numbers, strict=True):
             check_text_complete(folder / f"{name}.txt", number)
-        check_coordinates(_points_and_tracks(model)[0], folder / "points3D.txt")
+        heads = [(number, point.xyz) for number, point in model.points3D.items()]
+        check_coordinates(np.array(heads, dtype=[("id", "u8"), ("xyz", "f8", 3)]), folder / "points3D.txt")
     return model
 
 
@@ -329,8 +334,10 @@ def _consistent(model: Any, folder: Path, suffix: str) -> Any:
 def _contradiction(model: Any, size: float = 1.0) -> str:
     """Describe how many images of a model see points off their observations, in pixels of images `size` times as large.
 
-    Returns "" if that is at most a tenth of them, given the stated errors of the points.
+    Returns "" if that is at most a tenth of them, given the stated errors of the points, and frames have known images.
     """
+    if missing := {data.id for frame in model.frames.values() for data in frame.image_ids} - {*model.images}:
+        return f"{len(missing)} images of the frames are missing"
     side_px = max((max(camera.width, camera.height) for camera in model.cameras.values()), default=1) * size
     # COLMAP drops observations with larger errors than 4 px; programs that state no errors may keep them
     stated_px = model.compute_mean_reprojection_error() or side_px / 400

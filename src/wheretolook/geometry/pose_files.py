@@ -226,10 +226,10 @@ def _without_names(path: Path, rows: list[tuple[int, list[str]]], of_cameras: bo
     """Recognize rows without names of their columns by the number of cells, unit quaternions and rotations."""
     n = len(rows[0][1])
     if n == 4 and all(_is_number(cells[0]) for _, cells in rows):
-        first = NamedRows(path, ("id", *"xyz"), rows).numbers(["id"])[:, 0]
-        if (np.diff(first) <= 0).any() and (
-            (first % 1).any() or len({*first}) < len(first)
-        ):  # neither times nor numbers
+        ids = NamedRows(path, ("id", *"xyz"), rows).numbers(["id"])[:, 0]
+        is_time = (np.diff(ids) > 0).all()
+        is_number = not (ids % 1).any() and len({*ids}) == len(ids)
+        if not is_time and not is_number:
             fix = "Start the file with '# x y z yaw_deg' or '# id x y z'."
             problem = "four columns of numbers do not show whether they are id x y z, or x y z and a yaw"
             raise TableError(problem, path=path, value=" ".join(rows[0][1])[:80], fix=fix)

@@ -143,7 +143,7 @@ def angle_deg(cosine: ArrayLike) -> Float:
     return np.degrees(np.arccos(np.clip(cosine, -1, 1)))
 
 
-def as_points(values: ArrayLike) -> Float:
+def as_points(values: ArrayLike) -> NDArray[np.float64]:
     """Return points as float64 (N, 3); one point (3,) is N = 1."""
     return np.asarray(values, dtype=np.float64).reshape(-1, 3)
 

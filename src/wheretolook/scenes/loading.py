@@ -11,6 +11,7 @@ import math
 import os
 import re
 import struct
+import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
 from os import PathLike
@@ -25,7 +26,7 @@ from PIL import Image
 from wheretolook.geometry.mesh import TexturedMesh
 from wheretolook.geometry.similarity import local_origin
 from wheretolook.utils.devices import fitting
-from wheretolook.utils.errors import SceneError, check_choice, check_range
+from wheretolook.utils.errors import MapWarning, SceneError, check_choice, check_range
 from wheretolook.utils.files import image_size, max_expanded_bytes, parse_json_object, read_text, write_bytes
 
 # Rotations that turn the named axis of a file into the world's z axis.
@@ -69,7 +70,9 @@ def load_mesh(path: str | PathLike[str], up: str = "z", colored: bool = True) ->
     file = _mesh_file(Path(path))
     _check_file(file)
     try:
-        source: Any = {".glb": _with_all_applied, ".obj": _with_positive_indices}.get(file.suffix.lower(), str)(file)
+        source: Any = {".glb": _with_float_positions, ".obj": _with_positive_indices}.get(file.suffix.lower(), str)(
+            file
+        )
         named: dict[str, Any] = {
             "file_type": file.suffix[1:].lower(),
             "resolver": trimesh.resolvers.FilePathResolver(str(file)),
@@ -202,53 +205,37 @@ def _check_readable(tree: dict[str, Any], path: Path) -> None:
         unread |= {name for primitive in primitives for name in primitive.get("extensions", {})} or {"sparse accessors"}
     if any(primitive.get("mode") == 6 for primitive in primitives):
         unread.add("triangle fans")
+    if "KHR_texture_transform" in str([material.get("pbrMetallicRoughness") for material in tree.get("materials", [])]):
+        text = "its textures are used without their offset, rotation and scale (KHR_texture_transform)"
+        warnings.warn(f"{path}: {text}", MapWarning, stacklevel=5)
     if unread:
         fix = "Export it from Blender as GLB without compression and instances, or as PLY."
         problem = "the mesh is compressed, or stored in another way that is not read"
         raise SceneError(problem, path=path, value=", ".join(sorted(unread)), fix=fix)
 
 
-def _with_all_applied(path: Path) -> str | io.BytesIO:
-    """The file, or its content with what trimesh ignores applied: normalized integers, and transforms of textures.
+def _with_float_positions(path: Path) -> str | io.BytesIO:
+    """The file, or its content with float numbers for normalized integers (glTF 2.0, 3.6.2.2), which trimesh ignores.
 
-    Normalized integers (glTF 2.0, 3.6.2.2) become float numbers, other than colours, which trimesh expects as integers.
-    Texture coordinates are transformed by the extension KHR_texture_transform of their material's colour.
+    Colours stay integers, as trimesh expects.
     """
     tree, content = _read_glb(path)
-    accessors = tree.get("accessors", [])
     primitives = [primitive for mesh in tree.get("meshes", []) for primitive in mesh["primitives"]]
     used = {at for primitive in primitives for name, at in primitive["attributes"].items() if name[:5] != "COLOR"}
-    changed: list[tuple[dict[str, Any], dict[str, Any]]] = [
-        (accessors[at], {}) for at in sorted(used) if accessors[at].get("normalized")
-    ]
-    for primitive in primitives:
-        material = tree["materials"][primitive["material"]] if "material" in primitive else {}
-        texture = material.get("pbrMetallicRoughness", {}).get("baseColorTexture", {})
-        if transform := texture.get("extensions", {}).get("KHR_texture_transform"):
-            chosen = {**texture, **transform}.get("texCoord", 0)
-            accessor = {**accessors[primitive["attributes"][f"TEXCOORD_{chosen}"]]}
-            primitive["attributes"]["TEXCOORD_0"] = len(accessors)
-            accessors.append(accessor)
-            changed.append((accessor, transform))
-    if not changed:
+    normalized = [tree["accessors"][at] for at in sorted(used) if tree["accessors"][at].get("normalized")]
+    if not normalized:
         return str(path)
     buffers = _buffers(tree, content, path)
     tree["buffers"].append({})
     decoded = b""
-    for accessor, transform in changed:
+    for accessor in normalized:
         view = tree["bufferViews"][accessor["bufferView"]]
-        kind = np.dtype({5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}[accessor["componentType"]])
+        kind = np.dtype({5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2"}[accessor["componentType"]])
         shape = accessor["count"], {"VEC2": 2, "VEC3": 3, "VEC4": 4}[accessor["type"]]
         strides = view.get("byteStride", shape[1] * kind.itemsize), kind.itemsize
         start = view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
-        numbers = np.ndarray(shape, kind, buffers[view["buffer"]], start, strides)
-        if accessor.get("normalized"):
-            numbers = np.maximum(numbers / np.float32(np.iinfo(kind).max), -1)
-        if transform:
-            angle = transform.get("rotation", 0)
-            turn = np.array([(np.cos(angle), np.sin(angle)), (-np.sin(angle), np.cos(angle))])
-            numbers = numbers * transform.get("scale", (1, 1)) @ turn.T + transform.get("offset", (0, 0))
-        values = numbers.astype("<f4").tobytes()
+        stored = np.ndarray(shape, kind, buffers[view["buffer"]], start, strides)
+        values = np.maximum(stored / np.float32(np.iinfo(kind).max), -1).astype("<f4").tobytes()
         accessor |= {
             "bufferView": len(tree["bufferViews"]),
             "byteOffset": 0,

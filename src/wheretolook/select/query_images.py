@@ -112,12 +112,12 @@ class QueryImages:
         fitting = [rgb for rgb in readings if any(_has_proportions(one, rgb) for one in candidates)]
         rgb = (fitting or readings)[0]
         quarters = 0 if path is None or self.upright is (rgb is readings[0]) else quarters_upright(path) % 4
-        if known is not None and fitting:
-            return replace(_fitted(name, rgb, known, known_from), quarters=quarters)
-        if known is not None:
+        if known is None:
+            return replace(self._assumed(path, name, rgb), quarters=quarters)
+        if not fitting:
             problem = f"the image of {_size(rgb)} has other proportions than the camera"
             raise ConfigError(problem, path=path, value=describe_camera(known), fix="Correct --camera.")
-        return replace(self._assumed(path, name, rgb), quarters=quarters)
+        return replace(_fitted(name, rgb, known, known_from), quarters=quarters)
 
     def photograph(self, name: str) -> Path | None:
         """Return the file of a mapping image; None if it is not found."""

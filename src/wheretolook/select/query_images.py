@@ -131,14 +131,13 @@ class QueryImages:
     def _is_mapping_image(self, path: Path, readings: Sequence[NDArray[np.uint8]], name: str) -> bool:
         """Test whether a file is the mapping image of this name, not another zoom, size or place.
 
-        It is the same file, or has its size and EXIF focal length. Where the photographs are not found, it must have the
-        proportions and at least the size of the camera, and no EXIF focal length that contradicts it.
+        It is the same file. Where the photographs are not found, it must have the proportions and at least the size of the
+        camera, and no EXIF focal length that contradicts it.
         """
-        in_exif = exif_focal_px(path)
         original = self.photograph(name)
         if original is not None:
-            same_focal = in_exif is not None and in_exif == exif_focal_px(original)  # in pixels of its size
-            return same_focal or filecmp.cmp(path, original, shallow=False)
+            return filecmp.cmp(path, original, shallow=False)
+        in_exif = exif_focal_px(path)
         camera = self.by_name[name]
         ratio = max(readings[0].shape) / max(camera.width, camera.height)
         agrees = (

@@ -140,10 +140,10 @@ class QueryImages:
         in_exif = exif_focal_px(path)
         camera = self.by_name[name]
         ratio = max(readings[0].shape) / max(camera.width, camera.height)
-        agrees = (
-            in_exif is None or abs(np.log(in_exif / (camera.colmap.mean_focal_px * ratio))) < 0.05
-        )  # as in `_assumed`
-        return ratio >= 1 and bool(agrees) and any(_has_proportions(camera, rgb) for rgb in readings)
+        if ratio < 1 or not any(_has_proportions(camera, rgb) for rgb in readings):
+            return False
+        expected = camera.colmap.mean_focal_px * ratio
+        return in_exif is None or 0.95 < in_exif / expected < 1.05  # as in `_assumed`
 
     def _known(
         self, path: Path | None, name: str, given: KnownCamera | None, readings: Sequence[NDArray[np.uint8]]

@@ -16,7 +16,7 @@ from box_scenes import random_texture
 from scenes.test_loading import FACES, VERTICES, textured
 from wheretolook.scenes.loading import load_mesh
 from wheretolook.utils import devices as memory
-from wheretolook.utils.errors import MapWarning, SceneError
+from wheretolook.utils.errors import SceneError
 
 
 def png(height=4, width=6):
@@ -184,15 +184,20 @@ def test_normalized_integers_are_fractions_of_the_largest(whole, kind):
     np.testing.assert_array_equal(mesh.textures[0], expected.textures[0])
 
 
-def test_transforms_of_textures_are_named(whole):
-    def change(tree, _):
+@pytest.mark.parametrize("kind", [None, "uint16"])
+def test_texture_coordinates_are_transformed(whole, kind):
+    """Scaled, turned by a quarter from v to u, and moved (KHR_texture_transform)."""
+    u, v = load_mesh(whole).corner_uvs.reshape(-1, 2).T
+
+    def change(tree, buffer):
         texture = tree["materials"][0]["pbrMetallicRoughness"]["baseColorTexture"]
-        texture["extensions"] = {"KHR_texture_transform": {"offset": [0.25, 0.5]}}
-        return tree
+        turn = {"offset": [0.25, 0.5], "rotation": np.pi / 2, "scale": [0.5, 0.2]}
+        texture["extensions"] = {"KHR_texture_transform": turn}
+        return quantized(kind)(tree, buffer) if kind else tree
 
     rewrite(whole, change)
-    with pytest.warns(MapWarning, match="KHR_texture_transform"):
-        load_mesh(whole)
+    found = load_mesh(whole).corner_uvs.reshape(-1, 2)
+    np.testing.assert_allclose(found, np.column_stack([0.25 + 0.2 * v, 0.5 - 0.5 * u]), atol=1e-5)
 
 
 def compressed(tree, _):

@@ -169,7 +169,7 @@ class Adapt(SceneOptions, LabelOptions, FrameOptions):
         reconstruction = read_model(model)
         frame = find_frame(model, reconstruction, self.frame_options())
         log(f"{name}: {'; '.join((frame.describe(), *frame.doubts))}")
-        scene = Scene.of_colmap(ColmapFiles(model), occlusion=occlusion, device=self.warp_device)
+        scene = Scene.of_colmap(ColmapFiles(model), None, occlusion, device=self.warp_device)
         views, whole = self._held_out(model, name, scene.occlusion, target.weights, log)
         _check_enough(views, model)
         with hold(target.path.with_name(f".{target.path.name}.lock"), "adapt"):

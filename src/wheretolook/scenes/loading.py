@@ -11,7 +11,6 @@ import math
 import os
 import re
 import struct
-import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
 from os import PathLike
@@ -26,7 +25,7 @@ from PIL import Image
 from wheretolook.geometry.mesh import TexturedMesh
 from wheretolook.geometry.similarity import local_origin
 from wheretolook.utils.devices import fitting
-from wheretolook.utils.errors import MapWarning, SceneError, check_choice, check_range
+from wheretolook.utils.errors import SceneError, check_choice, check_range
 from wheretolook.utils.files import image_size, max_expanded_bytes, parse_json_object, read_text, write_bytes
 
 # Rotations that turn the named axis of a file into the world's z axis.
@@ -70,14 +69,12 @@ def load_mesh(path: str | PathLike[str], up: str = "z", colored: bool = True) ->
     file = _mesh_file(Path(path))
     _check_file(file)
     try:
-        source: Any = {".glb": _with_float_positions, ".obj": _with_positive_indices}.get(file.suffix.lower(), str)(
-            file
-        )
-        named: dict[str, Any] = {
-            "file_type": file.suffix[1:].lower(),
-            "resolver": trimesh.resolvers.FilePathResolver(str(file)),
-        }
-        scene = trimesh.load_scene(source, process=False, **({} if source == str(file) else named))
+        corrected = {".glb": _with_all_applied, ".obj": _with_positive_indices}.get(file.suffix.lower())
+        changed = corrected(file) if corrected else None
+        source, kind = changed or (file.open("rb"), file.suffix[1:].lower())
+        with source:
+            resolver = trimesh.resolvers.FilePathResolver(str(file))
+            scene = trimesh.load_scene(source, file_type=kind, resolver=resolver, process=False)
         parts = list(_parts(scene))
     except Exception as error:  # trimesh's parsers raise errors of many kinds
         raise SceneError("the mesh cannot be read", path=file, value=str(error), fix="Check the file") from error
@@ -164,7 +161,7 @@ def _glb_textures(path: Path) -> Iterator[Path | bytes]:
     shown = [meshes[node["mesh"]] for node in tree.get("nodes", []) if "mesh" in node]
     if sum(map(len, meshes + shown)) > 40_000:  # trimesh takes 0.3 ms for each
         raise ValueError("its meshes and nodes have more than 40,000 parts; join them")
-    drawn = [part.get("indices", part["attributes"]["POSITION"]) for part in itertools.chain(*shown)]
+    drawn = [part.get("indices", part["attributes"]["POSITION"]) for part in itertools.chain.from_iterable(shown)]
     n_corners = sum(accessors[at]["count"] for at in drawn)
     if n_corners > fitting(200):  # bytes of a corner while it is read
         raise ValueError(f"its nodes have {n_corners // 3:,} triangles together")
@@ -185,6 +182,10 @@ def _read_glb(path: Path) -> tuple[dict[str, Any], bytes]:
     return parse_json_object(content[20 : 20 + json_length].decode()), content[28 + json_length :]
 
 
+def _primitives(tree: dict[str, Any]) -> list[dict[str, Any]]:
+    return [primitive for mesh in tree.get("meshes", []) for primitive in mesh["primitives"]]
+
+
 def _buffers(tree: dict[str, Any], content: bytes, path: Path) -> list[bytes]:
     sources = [_at_uri(one["uri"], path) if "uri" in one else content for one in tree.get("buffers", [])]
     return [source.read_bytes() if isinstance(source, Path) else source for source in sources]
@@ -192,7 +193,7 @@ def _buffers(tree: dict[str, Any], content: bytes, path: Path) -> list[bytes]:
 
 def _check_readable(tree: dict[str, Any], path: Path) -> None:
     """Raise SceneError if geometry of a glTF file is stored in a way that is not read."""
-    primitives = [primitive for mesh in tree.get("meshes", []) for primitive in mesh["primitives"]]
+    primitives = _primitives(tree)
     positions = [tree["accessors"][primitive["attributes"]["POSITION"]] for primitive in primitives]
     # materials and textures may change how a mesh appears, but not where it is
     unread = {
@@ -205,37 +206,52 @@ def _check_readable(tree: dict[str, Any], path: Path) -> None:
         unread |= {name for primitive in primitives for name in primitive.get("extensions", {})} or {"sparse accessors"}
     if any(primitive.get("mode") == 6 for primitive in primitives):
         unread.add("triangle fans")
-    if "KHR_texture_transform" in str([material.get("pbrMetallicRoughness") for material in tree.get("materials", [])]):
-        text = "its textures are used without their offset, rotation and scale (KHR_texture_transform)"
-        warnings.warn(f"{path}: {text}", MapWarning, stacklevel=5)
     if unread:
         fix = "Export it from Blender as GLB without compression and instances, or as PLY."
         problem = "the mesh is compressed, or stored in another way that is not read"
         raise SceneError(problem, path=path, value=", ".join(sorted(unread)), fix=fix)
 
 
-def _with_float_positions(path: Path) -> str | io.BytesIO:
-    """The file, or its content with float numbers for normalized integers (glTF 2.0, 3.6.2.2), which trimesh ignores.
+def _with_all_applied(path: Path) -> tuple[io.BytesIO, str] | None:
+    """The file as glTF with what trimesh ignores applied: normalized integers, and transforms of textures; None without.
 
-    Colours stay integers, as trimesh expects.
+    Normalized integers (glTF 2.0, 3.6.2.2) become float numbers, other than colours, which trimesh expects as integers.
+    Texture coordinates are transformed by the extension KHR_texture_transform of their material's colour.
     """
     tree, content = _read_glb(path)
-    primitives = [primitive for mesh in tree.get("meshes", []) for primitive in mesh["primitives"]]
+    accessors = tree.get("accessors", [])
+    primitives = _primitives(tree)
     used = {at for primitive in primitives for name, at in primitive["attributes"].items() if name[:5] != "COLOR"}
-    normalized = [tree["accessors"][at] for at in sorted(used) if tree["accessors"][at].get("normalized")]
-    if not normalized:
-        return str(path)
+    changed: list[tuple[dict[str, Any], dict[str, Any]]] = [
+        (accessors[at], {}) for at in sorted(used) if accessors[at].get("normalized")
+    ]
+    for primitive in primitives:
+        material = tree["materials"][primitive["material"]] if "material" in primitive else {}
+        texture = material.get("pbrMetallicRoughness", {}).get("baseColorTexture", {})
+        if transform := texture.get("extensions", {}).get("KHR_texture_transform"):
+            chosen = {**texture, **transform}.get("texCoord", 0)
+            accessor = {**accessors[primitive["attributes"][f"TEXCOORD_{chosen}"]]}
+            primitive["attributes"]["TEXCOORD_0"] = len(accessors)
+            accessors.append(accessor)
+            changed.append((accessor, transform))
+    if not changed:
+        return None
     buffers = _buffers(tree, content, path)
-    tree["buffers"].append({})
     decoded = b""
-    for accessor in normalized:
+    for accessor, transform in changed:
         view = tree["bufferViews"][accessor["bufferView"]]
-        kind = np.dtype({5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2"}[accessor["componentType"]])
+        kind = np.dtype({5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}[accessor["componentType"]])
         shape = accessor["count"], {"VEC2": 2, "VEC3": 3, "VEC4": 4}[accessor["type"]]
         strides = view.get("byteStride", shape[1] * kind.itemsize), kind.itemsize
         start = view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
-        stored = np.ndarray(shape, kind, buffers[view["buffer"]], start, strides)
-        values = np.maximum(stored / np.float32(np.iinfo(kind).max), -1).astype("<f4").tobytes()
+        numbers = np.ndarray(shape, kind, buffers[view["buffer"]], start, strides)
+        if accessor.get("normalized"):
+            numbers = np.maximum(numbers / np.float32(np.iinfo(kind).max), -1)
+        if transform:
+            angle = transform.get("rotation", 0)
+            turn = np.array([(np.cos(angle), np.sin(angle)), (-np.sin(angle), np.cos(angle))])
+            numbers = numbers * transform.get("scale", (1, 1)) @ turn.T + transform.get("offset", (0, 0))
+        values = numbers.astype("<f4").tobytes()
         accessor |= {
             "bufferView": len(tree["bufferViews"]),
             "byteOffset": 0,
@@ -244,25 +260,21 @@ def _with_float_positions(path: Path) -> str | io.BytesIO:
         }
         tree["bufferViews"].append({"buffer": len(buffers), "byteOffset": len(decoded), "byteLength": len(values)})
         decoded += values
-    tree["buffers"][-1] = {
-        "byteLength": len(decoded),
-        "uri": f"data:application/octet-stream;base64,{base64.b64encode(decoded).decode()}",
-    }
-    chunk = json.dumps(tree).encode()
-    chunk += b" " * (-len(chunk) % 4)
-    own = struct.pack("<I4s", len(content), b"BIN\0") + content if content else b""
-    header = struct.pack("<4sIII4s", b"glTF", 2, 20 + len(chunk) + len(own), len(chunk), b"JSON")
-    return io.BytesIO(header + chunk + own)
+    tree["buffers"] = []
+    for buffer in (*buffers, decoded):
+        uri = f"data:application/octet-stream;base64,{base64.b64encode(buffer).decode()}"
+        tree["buffers"].append({"byteLength": len(buffer), "uri": uri})
+    return io.BytesIO(json.dumps(tree).encode()), "gltf"
 
 
-def _with_positive_indices(path: Path) -> str | io.StringIO:
-    """The OBJ file, or its text with indices from the start of the file for those from the line, which trimesh ignores.
+def _with_positive_indices(path: Path) -> tuple[io.StringIO, str] | None:
+    """The text of an OBJ file with indices from the start of the file for those from the line, which trimesh ignores.
 
-    Raises ValueError for an index before the first element.
+    None if it has no such index. Raises ValueError for one before the first element.
     """
     with path.open(encoding="utf-8", errors="replace") as file:
         if not any(line.startswith("f") and "-" in line for line in file):
-            return str(path)
+            return None
     counts = dict.fromkeys(("v", "vt", "vn"), 0)
     lines = []
     for line in path.read_text(encoding="utf-8", errors="replace").replace("\\\n", " ").splitlines():
@@ -273,7 +285,7 @@ def _with_positive_indices(path: Path) -> str | io.StringIO:
             corners = [word.split("/") for word in words[1:]]
             line = " ".join(["f", *("/".join(map(_positive, corner, counts.values())) for corner in corners)])
         lines.append(line)
-    return io.StringIO("\n".join(lines) + "\n")
+    return io.StringIO("\n".join(lines) + "\n"), "obj"
 
 
 def _positive(index: str, count: int) -> str:

@@ -169,12 +169,9 @@ class QueryImages:
         """Assume the camera of an image: one of the map, whatever the EXIF data say, or a pinhole by these."""
         height, width = rgb.shape[:2]
         in_exif = None if path is None else exif_focal_px(path)
-        cameras = {number: one for number, one in self.cameras.items() if _has_proportions(one, rgb)}
-        turns = [0]
-        if not cameras:
-            sideways = np.swapaxes(rgb, 0, 1)
-            cameras = {number: one for number, one in self.cameras.items() if _has_proportions(one, sideways)}
-            turns = [1, 3]
+        fits = any(_has_proportions(one, rgb) for one in self.cameras.values())
+        turns, shown = ([0], rgb) if fits else ([1, 3], np.swapaxes(rgb, 0, 1))
+        cameras = {number: one for number, one in self.cameras.items() if _has_proportions(one, shown)}
         if not cameras and in_exif is not None:
             focal = FocalPrior((in_exif,), (0.03,))  # whole millimetres; crops and resized photographs
             return _fitted(name, rgb, PinholeCamera(width, height, in_exif), "assumed: EXIF focal length", focal)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from wheretolook.dataset.config import ACCURACY, Accuracy
-from wheretolook.dataset.scene import ColmapFiles, Scene, SceneConfig
+from wheretolook.dataset.scene import ColmapFiles, Scene
 from wheretolook.geometry.camera import Camera, PinholeCamera, parse_camera
 from wheretolook.geometry.lattices import Lattice, direction_lattice
 from wheretolook.geometry.poses import Float, camera_centers, rigid_poses
@@ -132,7 +132,7 @@ class WhereToLook:
         mesh, depth, database = (None if file is None else Path(file) for file in (mesh, depth, database))
         options = FrameOptions(**frame)
         files = ColmapFiles(Path(path), mesh, depth, depth_scale, database, max_reprojection_error_px, options, mesh_up)
-        scene = Scene.of_colmap(files, camera, occlusion, SceneConfig(occlusion_cache_bytes=1 << 30), device)
+        scene = Scene.of_colmap(files, camera, occlusion, device, cache_bytes=1 << 30)
         of_each &= fov_deg is None and len({*scene.map.cameras.values()}) > 1
         if of_each:
             scene.camera = next(iter(scene.map.cameras.values()))

@@ -251,10 +251,9 @@ class Adapt(SceneOptions, LabelOptions, FrameOptions):
         params |= {"scale": adapted.scale, "offset": adapted.offset}
         metrics = {**gain.after, **{f"{name}_before": value for name, value in gain.before.items()}}
         metrics |= {"better": float(is_better), "log_loss_less": gain.log_loss_less[0]}
+        report = target.path.with_suffix(".md")
         with start_run(self.tracking, target.name, "adapt", params) as (client, run):
-            log_to_run(client, run, metrics=metrics)
-            for path in (target.path.with_suffix(".md"), *([target.path] if is_better else [])):
-                client.log_artifact(run, str(path))
+            log_to_run(client, run, metrics=metrics, files=(report, target.path) if is_better else (report,))
 
     def _labelled(self, files: SceneFolder, scene: Scene, has_photographs: bool, log: Log) -> pd.DataFrame | None:
         """Return the scene's labelled viewpoints: all if `label` has run, else those that the time allows.

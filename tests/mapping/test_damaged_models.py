@@ -27,7 +27,6 @@ CHANGES = [
     ("cameras", 16, "<Q", 2**40),
     ("cameras", 12, "<i", 99),  # camera model
     *[("cameras", 32, "<d", focal) for focal in (NAN, 0.0, -320.0)],
-    ("cameras", 40, "<d", 1e5),  # principal point
     ("points3D", 8 + 51, "<I", 99),  # image of a track
 ]
 

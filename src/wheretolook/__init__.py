@@ -24,7 +24,7 @@ if TYPE_CHECKING:
         check_poses as check_poses,
         poses_looking_along as poses_looking_along,
     )
-    from wheretolook.geometry.tsdf import DepthImage as DepthImage, TsdfConfig as TsdfConfig, TsdfVolume as TsdfVolume
+    from wheretolook.geometry.tsdf import DepthImage as DepthImage, TsdfVolume as TsdfVolume
     from wheretolook.geometry.views import Views as Views
     from wheretolook.inputs.localization_map import LocalizationMap as LocalizationMap
     from wheretolook.mapping.config import FrameOptions as FrameOptions
@@ -100,7 +100,7 @@ _NAMES = {
     "geometry.camera": "ColmapCamera PinholeCamera camera_of",
     "geometry.poses": "camera_centers check_poses poses_looking_along",
     "geometry.lattices": "VoxelGrid fibonacci_sphere",
-    "geometry.tsdf": "DepthImage TsdfConfig TsdfVolume",
+    "geometry.tsdf": "DepthImage TsdfVolume",
     "scorers.registry": "Learner Method describe_methods make_scorer",
     "scorers.weights": "load_scorer resolve_weights weights_by_method",
     "scorers.base": "CountingScorer Scorer",

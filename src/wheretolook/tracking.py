@@ -321,13 +321,17 @@ def _open_run(mlflow_client: MlflowClient, experiment: str, name: str, tags: Map
     mlflow_client.set_terminated(run_id, status="FINISHED")
 
 
-def log(mlflow_client: MlflowClient, run_id: str, params: Values = None, metrics: Values = None) -> None:
-    """Log parameters and metrics of a run. Metrics that are not finite are skipped."""
+def log(
+    mlflow_client: MlflowClient, run_id: str, params: Values = None, metrics: Values = None, files: Iterable[Path] = ()
+) -> None:
+    """Log parameters, metrics and files of a run. Metrics that are not finite are skipped."""
     log_metrics(mlflow_client, run_id, [(0, metrics or {})])
     if params:
         param = mlflow_package().entities.Param
         texts = [param(key, str(value)) for key, value in params.items()]
         mlflow_client.log_batch(run_id, params=texts)
+    for file in files:
+        mlflow_client.log_artifact(run_id, str(file))
 
 
 def log_history(mlflow_client: MlflowClient, run_id: str, history: pd.DataFrame) -> None:
@@ -370,9 +374,7 @@ def log_nested(tracking: TrackingConfig, parent: str, stage: str, runs: Iterable
     for run in runs:
         name = run_name(run.what, stage, str(run.params.get("dataset", "")))
         with _open_run(mlflow_client, experiment, name, all_tags) as run_id:
-            log(mlflow_client, run_id, run.params, run.metrics)
-            for file in run.files:
-                mlflow_client.log_artifact(run_id, str(file))
+            log(mlflow_client, run_id, run.params, run.metrics, run.files)
 
 
 def newest_run(

@@ -7,7 +7,7 @@ import pytest
 from box_scenes import furnished_room
 from planning.rooms import CAMERA, room_landmarks
 from wheretolook.dataset.layout import SceneFolder
-from wheretolook.dataset.scene import ColmapFiles, Scene, SceneConfig
+from wheretolook.dataset.scene import ColmapFiles, Scene
 from wheretolook.geometry.lattices import ViewLattice
 from wheretolook.rendering import raycasting
 from wheretolook.scenes.loading import save_glb
@@ -45,7 +45,7 @@ def test_without_a_mesh_landmarks_hide_one_another_and_a_unit_is_needed(files):
     write_json(files.map / "report.json", {"scale": {"source": "unknown"}})
     scene = Scene(files, CAMERA)
     assert scene.is_photographed and isinstance(scene.occlusion, HiddenPointRemoval)
-    none = SceneConfig(OcclusionConfig(model="none"))
+    none = OcclusionConfig(model="none")
     assert Scene(files, CAMERA, none).occlusion_config.model == "none"
     with pytest.raises(MapError):
         _ = scene.space
@@ -59,14 +59,14 @@ def test_without_a_mesh_landmarks_hide_one_another_and_a_unit_is_needed(files):
 def test_an_occlusion_model_needs_its_files(occlusion, mesh, depth):
     with pytest.raises(ConfigError):
         files = ColmapFiles(Path("sparse"), mesh=mesh and Path(mesh), depth=depth and Path(depth))
-        Scene.of_colmap(files, occlusion=occlusion)
+        Scene.of_colmap(files, occlusion_name=occlusion)
 
 
 def test_the_most_accurate_occlusion_model_is_the_default(files):
     by_mesh = Scene.of_colmap(ColmapFiles(Path("sparse"), mesh=files.mesh))
     assert by_mesh.available_occlusion == ("mesh", "hidden-points", "none") and by_mesh.occlusion_config.model == "mesh"
     assert isinstance(Scene.of_colmap(ColmapFiles(Path("sparse"))).occlusion, HiddenPointRemoval)
-    cached = Scene.of_colmap(ColmapFiles(Path("sparse")), config=SceneConfig(occlusion_cache_bytes=1 << 20))
+    cached = Scene.of_colmap(ColmapFiles(Path("sparse")), cache_bytes=1 << 20)
     assert isinstance(cached.occlusion, CachedOcclusion)
 
 

@@ -42,6 +42,18 @@ def test_corrupt_binary_models_are_rejected_by_file(tmp_path, name, offset, layo
     assert caught.value.path == path and caught.value.fix
 
 
+def test_frames_with_images_that_are_missing_are_older_than_the_images(tmp_path):
+    path = written(rig_model(), tmp_path / "model", text=True)
+    with (path / "frames.txt").open("a") as file:
+        file.write("99 1 1 0 0 0 0 0 0 1 CAMERA 1 999\n")
+    expected = written(rig_model(), tmp_path / "expected", text=True)
+    (expected / "frames.txt").unlink()
+    (expected / "rigs.txt").unlink()
+    with pytest.warns(MapWarning, match="frames"):
+        found = read_model(path)
+    np.testing.assert_array_equal(colmap_poses(path, found), colmap_poses(expected, read_model(expected)))
+
+
 @pytest.mark.parametrize(
     ("name", "old", "new"),
     [

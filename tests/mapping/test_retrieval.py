@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from wheretolook.features.extractor import SIFT
-from wheretolook.mapping.retrieval import photograph_pairs
+from wheretolook.mapping.triangulation import photograph_pairs
 
 N = 80
 SHARED = 5  # photographs that are fewer places apart show the same

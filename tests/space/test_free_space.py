@@ -8,7 +8,7 @@ from box_scenes import CABINET, ROOM, TABLE_TOP, box_quads, furnished_room, quad
 from depth_room import CAMERA, ROOM as DEPTH_ROOM, depth_images, room
 from wheretolook.geometry.mesh import TexturedMesh
 from wheretolook.geometry.poses import poses_looking_along
-from wheretolook.geometry.tsdf import DepthImage, TsdfConfig, TsdfVolume
+from wheretolook.geometry.tsdf import DepthImage, TsdfVolume
 from wheretolook.rendering.raycasting import MeshRaycaster
 from wheretolook.space.config import FreeSpaceConfig, MappedSpaceConfig
 from wheretolook.space.free_space import FreeSpace, TsdfSpace, seen_through
@@ -136,7 +136,7 @@ CLEARANCE_M = 0.2
 
 
 def space_of(images):
-    volume = TsdfVolume.from_images(images, TsdfConfig(voxel_size_m=VOXEL_M), progress=False)
+    volume = TsdfVolume.from_images(images, VOXEL_M, progress=False)
     return TsdfSpace(volume, images, FreeSpaceConfig(clearance_m=CLEARANCE_M), progress=False)
 
 

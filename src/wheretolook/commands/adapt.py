@@ -45,8 +45,6 @@ if TYPE_CHECKING:
     from wheretolook.visibility.occlusion import OcclusionModel
 
 FOLDER = "adapted"  # of a dataset: adapted weights, and what they have gained
-MIN_OF_EACH_LABEL = 10
-_VIEWS_PER_TASK = 128  # the time is checked after each task
 
 
 @dataclass(frozen=True)
@@ -169,7 +167,7 @@ class Adapt(SceneOptions, LabelOptions, FrameOptions):
         reconstruction = read_model(model)
         frame = find_frame(model, reconstruction, self.frame_options())
         log(f"{name}: {'; '.join((frame.describe(), *frame.doubts))}")
-        scene = Scene.of_colmap(ColmapFiles(model), occlusion=occlusion, device=self.warp_device)
+        scene = Scene.of_colmap(ColmapFiles(model), None, occlusion, device=self.warp_device)
         views, whole = self._held_out(model, name, scene.occlusion, target.weights, log)
         _check_enough(views, model)
         with hold(target.path.with_name(f".{target.path.name}.lock"), "adapt"):
@@ -251,10 +249,9 @@ class Adapt(SceneOptions, LabelOptions, FrameOptions):
         params |= {"scale": adapted.scale, "offset": adapted.offset}
         metrics = {**gain.after, **{f"{name}_before": value for name, value in gain.before.items()}}
         metrics |= {"better": float(is_better), "log_loss_less": gain.log_loss_less[0]}
+        report = target.path.with_suffix(".md")
         with start_run(self.tracking, target.name, "adapt", params) as (client, run):
-            log_to_run(client, run, metrics=metrics)
-            for path in (target.path.with_suffix(".md"), *([target.path] if is_better else [])):
-                client.log_artifact(run, str(path))
+            log_to_run(client, run, metrics=metrics, files=(report, target.path) if is_better else (report,))
 
     def _labelled(self, files: SceneFolder, scene: Scene, has_photographs: bool, log: Log) -> pd.DataFrame | None:
         """Return the scene's labelled viewpoints: all if `label` has run, else those that the time allows.
@@ -292,8 +289,9 @@ class Adapt(SceneOptions, LabelOptions, FrameOptions):
         table = table.iloc[np.argsort(order, kind="stable")].reset_index(drop=True)
         job = scene_job(files, self.label, extractor_of(files, self.extractor), scene.device)
         tasks = []
-        for begin in range(0, len(table), _VIEWS_PER_TASK):
-            part = table.iloc[begin : begin + _VIEWS_PER_TASK]
+        n_of_task = 128  # the time is checked after each task
+        for begin in range(0, len(table), n_of_task):
+            part = table.iloc[begin : begin + n_of_task]
             tasks.append(LabelTask(f"{files.name} {begin}", job, part, files.adapt_shards / f"{begin:06}"))
         log(f"{files.name}: labelling up to {len(table):,} views, for {minutes:g} minutes at most")
         done: dict[str, pd.DataFrame] = {}
@@ -325,7 +323,7 @@ def _check_enough(views: LocalizedViews, source: Path) -> None:
     n_good = int(views.good.sum())
     rendered = bool((views.photograph < 0).any())
     counts = (len(views), len(np.unique(views.group)), n_good, len(views) - n_good)
-    needed = (rendered * 100, rendered * 10, MIN_OF_EACH_LABEL, MIN_OF_EACH_LABEL)
+    needed = (rendered * 100, rendered * 10, 10, 10)
     if np.less(counts, needed).any():
         views_needed, places_needed, good_needed, bad_needed = needed
         problem = (

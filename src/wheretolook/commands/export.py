@@ -71,7 +71,7 @@ class Export(CameraOptions, MeshOptions, FrameOptions):
             self.map, mesh=self.mesh, mesh_up=self.mesh_up, database=self.database, frame=self.frame_options()
         )
         occlusion = "none" if self.mesh is None else "mesh"
-        scene = Scene.of_colmap(files, self.named_camera(), occlusion=occlusion)
+        scene = Scene.of_colmap(files, self.named_camera(), occlusion)
         source = scene.localization_map
         locations = None
         if self.mesh is not None:

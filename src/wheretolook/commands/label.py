@@ -189,9 +189,7 @@ def log_labels(
         written = [path for report in reports("label") for path in report(folder, views, f"Labels of {dataset.name}")]
         write_text(folder / LABELS_CSV, shares.to_csv(index=False))  # the last file: where it is, nothing is missing
         with start_run(tracking, "all scenes", "label", params, tags={"dataset": dataset.name}) as (client, run):
-            log_to_run(client, run, metrics=metrics)
-            for path in (folder / LABELS_CSV, *written):
-                client.log_artifact(run, str(path))
+            log_to_run(client, run, metrics=metrics, files=(folder / LABELS_CSV, *written))
     return shares
 
 

@@ -31,7 +31,7 @@ class Localize(CameraOptions, FrameOptions):
 
     Map: its descriptors are those of a COLMAP database or of hloc's features in HDF5, by default the ones in the model's
     folder or above it. Images are described by the extractor of these.
-    Camera: by default the model's for the mapping image of the same name. Otherwise it is assumed: one of the model of
+    Camera: by default, for a mapping image, the model's. Otherwise it is assumed: one of the model of
     the same proportions, or a pinhole of the EXIF focal length, whose focal length is refined with the pose, from 1/1.6 to
     1.6 of it; deviation and probability state what stays uncertain. The column camera_from names the camera, focal_px its
     focal length. A file of the cameras of images (--camera FILE) has lines such as hloc's queries_with_intrinsics.txt:

@@ -37,10 +37,8 @@ from wheretolook.geometry.camera import Camera, CameraConfig, PinholeCamera, cam
 from wheretolook.mapping.colmap_model import find_camera, read_model
 from wheretolook.mapping.config import FrameOptions, ImportConfig, MapConfig, PhotographsConfig, place_name
 from wheretolook.mapping.georeference import read_scale
-from wheretolook.mapping.imported_map import map_existing
 from wheretolook.mapping.map import choose_features, source_of_map
 from wheretolook.mapping.map_frame import check_overlap, read_frame, warn_of_mesh
-from wheretolook.mapping.photograph_map import map_photographs
 from wheretolook.mapping.photographs import list_photographs
 from wheretolook.utils.errors import ConfigError, MapError, SceneError, reject
 from wheretolook.utils.files import cache_key, check_folder_name, fingerprint, path_within, size_and_time
@@ -180,7 +178,7 @@ def _map_mesh(options: BuildMap, files: SceneFolder, log: Log) -> None:
     made_from = existing(files.mesh, SceneError, "scenes")
     floor = files.mapped_floor()
     camera = _mapping_camera(config, scene.camera, seed)
-    views = [asdict(scene.config.free_space), camera.record(), seed, made_from, *([floor] if floor else [])]
+    views = [asdict(scene.free_space), camera.record(), seed, made_from, *([floor] if floor else [])]
     cache = files.stage_cache("map", cache_key("map", [config.record(), *views]))
     model = (files.map / "cameras.bin", files.map / "images.bin", files.map / "points3D.bin")
     if cache.is_current(files.landmarks) and all(path.exists() for path in model):
@@ -247,6 +245,8 @@ def _map_photographs(options: BuildMap, log: Log) -> SceneFolder:
         log(f"{scene.name}: reusing {scene.map}")
         return _with_mapping_camera(options, scene)
 
+    from wheretolook.mapping.photograph_map import map_photographs  # loads pycolmap
+
     report = map_photographs(
         settings,
         scene.map,
@@ -302,6 +302,8 @@ def _import_model(options: BuildMap, log: Log) -> tuple[SceneFolder, Dataset]:
         if model.num_points3D():
             check_overlap(options.mesh, [point.xyz for point in model.points3D.values()], loaded.bounds)
     cache.clear()
+    from wheretolook.mapping.imported_map import map_existing  # loads pycolmap
+
     report = map_existing(
         settings,
         scene.map,

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeVar, get_args
 
 from wheretolook.dataset.config import RELEASE_FILE, SampleConfig
 from wheretolook.dataset.layout import Dataset
-from wheretolook.dataset.scene import Scene, SceneConfig
+from wheretolook.dataset.scene import Scene
 from wheretolook.features.extractor import ExtractorConfig
 from wheretolook.geometry.camera import Camera, CameraConfig, describe_camera, parse_camera
 from wheretolook.localization.config import LabelConfig
@@ -363,8 +363,7 @@ def load_dataset(
 
 def open_scene(options: SceneOptions, files: SceneFolder) -> Scene:
     """Return a scene of the dataset with a command's occlusion, free space and device; nothing is read yet."""
-    config = SceneConfig(options.occlusion, options.free_space, options.mapped_space)
-    scene = Scene(files, config=config, device=options.device)
+    scene = Scene(files, None, options.occlusion, options.free_space, options.mapped_space, options.device)
     if files.own_camera:
         camera = f"the camera of its map, {describe_camera(files.camera)}"
         LOG.info("%s: %s", files.name, "; ".join((camera, *scene.frame.doubts)))

@@ -128,9 +128,7 @@ def _log(options: Plan, dataset: str, scene: str, methods: list[str], path: Plan
         metrics |= {"stops": len(path.stops), "score_with_stops": float(path.scores_with_stops.mean())}
     run_name = joined(scene, methods[-1])
     with start_run(options.tracking, run_name, "plan", params, tags={"dataset": dataset}) as (client, run):
-        log_to_run(client, run, metrics=metrics)
-        for file in files:
-            client.log_artifact(run, str(file))
+        log_to_run(client, run, metrics=metrics, files=files)
 
 
 def _record(views: Views, landmarks: np.ndarray, file: Path) -> None:

@@ -58,10 +58,10 @@ class Sample(SceneOrMapOptions):
 
 def _key(scene: Scene, config: SampleConfig) -> str:
     files = scene.folder
-    space = asdict(scene.config.free_space)
+    space = asdict(scene.free_space)
     stage = "scenes"
     if scene.is_photographed:
-        space = asdict(scene.config.mapped_space)
+        space = asdict(scene.mapped_space_config)
         stage = "map"
     chosen = {name: value for name, value in asdict(config).items() if name != "memory_gb"}
     for name in ("cameras", "near_map"):
@@ -103,5 +103,5 @@ def _sample(scene: Scene, config: SampleConfig, log: Log) -> None:
     write_table(table, files.table)
     n_locations = table["location_id"].nunique()
     log(f"{scene.name}: {len(table):,} viewpoints at {n_locations} of {len(free)} free locations -> {files.table}")
-    if scene.occlusion_config != scene.config.occlusion:
+    if scene.occlusion_config != scene.given_occlusion:
         log(f"{scene.name}: occlusion by {scene.occlusion_config.model}, as there is no mesh")

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from wheretolook.commands.options import DatasetOptions, Log, Progress, ignore_progress, load_dataset
@@ -141,8 +140,8 @@ def _train(
             unlogged = {NOT_LOGGED: {"params": devices | result.counts, "history": history}}
             record = {"about": about, "weights_sha256": sha256(path), "run_id": "", "metrics": result.metrics}
             write_json(path.with_suffix(".json"), record | unlogged)
-            log_to_run(client, run_id, params=result.counts, metrics=kept_metrics(result.metrics))
-            _log_artifacts(client, run_id, path, result.history)
+            log_to_run(client, run_id, result.counts, kept_metrics(result.metrics), [path])
+            _log_history_file(client, run_id, result.history)
             if run_log.failed is not None:
                 raise run_log.failed
         write_json(path.with_suffix(".json"), record | {"run_id": run_id})
@@ -161,17 +160,16 @@ def _log_later(model: TrainedModel, tracking: TrackingConfig) -> TrainedModel:
     params = params_of(record["about"]) | record.pop(NOT_LOGGED, {}).get("params", {})
     with kept_if_not_logged(f"the training of {model.method}, {model.path}"):
         with start_run(tracking, model.method, "train", params) as (client, run_id):
-            log_to_run(client, run_id, metrics=kept_metrics(model.metrics))
+            log_to_run(client, run_id, metrics=kept_metrics(model.metrics), files=[model.path])
             if history is not None:
                 log_history(client, run_id, history)
-            _log_artifacts(client, run_id, model.path, history)
+            _log_history_file(client, run_id, history)
         write_json(model.path.with_suffix(".json"), record | {"run_id": run_id})
         return replace(model, run_id=run_id)
     return model
 
 
-def _log_artifacts(client: MlflowClient, run_id: str, weights: Path, history: pd.DataFrame | None) -> None:
-    client.log_artifact(run_id, str(weights))
+def _log_history_file(client: MlflowClient, run_id: str, history: pd.DataFrame | None) -> None:
     if history is None:
         return
     with temporary_folder() as folder:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from pkgutil import resolve_name
@@ -16,7 +16,7 @@ from wheretolook.geometry.camera import Camera, cameras_by_id, only_camera
 from wheretolook.geometry.lattices import ViewLattice, VoxelGrid
 from wheretolook.geometry.mesh import TexturedMesh
 from wheretolook.geometry.poses import Float, camera_centers
-from wheretolook.geometry.tsdf import DepthImage, DepthImages, TsdfConfig, TsdfVolume
+from wheretolook.geometry.tsdf import DepthImage, DepthImages, TsdfVolume
 from wheretolook.mapping.colmap_model import colmap_poses, read_model
 from wheretolook.mapping.config import FrameOptions, place_name
 from wheretolook.mapping.landmarks import Landmarks
@@ -72,24 +72,15 @@ class ColmapFiles:
         return Map.open(self.model, self.database, self.frame, self.max_reprojection_error_px, device, scale)
 
 
-@dataclass(frozen=True)
-class SceneConfig:
-    """Options of a scene."""
-
-    occlusion: OcclusionConfig = field(default_factory=OcclusionConfig)
-    free_space: FreeSpaceConfig = field(default_factory=FreeSpaceConfig)  # with a mesh or depth images
-    mapped_space: MappedSpaceConfig = field(default_factory=MappedSpaceConfig)  # with photographs alone
-    occlusion_cache_bytes: int = 0  # memory for lines of sight that are asked for again
-
-
 class Scene:
     """A map with its camera, occlusion models, free space and renderer; world in metres, z up.
 
     `files` are a scene of a dataset, known from a mesh or from photographs, or a COLMAP model, known from its landmarks
     and optionally a mesh or depth images. `camera` of the views takes the place of a dataset's camera; of a COLMAP
     model it is a camera or a camera_id, None for the only one. `device` runs the kernels: "cpu", a CUDA device, or
-    "auto" for the first GPU. `progress` shows bars where depth images are fused. `mesh` (metres, z up) takes the place
-    of that in the files.
+    "auto" for the first GPU. `free_space` is that of a mesh or depth images, `mapped_space` that of photographs alone.
+    `progress` shows bars where depth images are fused. With `cache_bytes` of memory, lines of sight that are asked for
+    again are not computed again. A mesh (metres, z up) or renderer that is assigned takes the place of that in the files.
 
     Raises (when a part is first used):
         SceneError: the mesh or the depth images are missing or cannot be used.
@@ -101,18 +92,22 @@ class Scene:
         self,
         files: SceneFolder | ColmapFiles,
         camera: Camera | int | None = None,
-        config: SceneConfig = SceneConfig(),
+        occlusion_config: OcclusionConfig = OcclusionConfig(),
+        free_space: FreeSpaceConfig = FreeSpaceConfig(),
+        mapped_space: MappedSpaceConfig = MappedSpaceConfig(),
         device: str = "cpu",
         progress: bool = True,
-        mesh: TexturedMesh | None = None,
+        cache_bytes: int = 0,
     ) -> None:
         self.files = files
         self.name = files.name
-        self.config = config
+        self.given_occlusion = occlusion_config
+        self.free_space = free_space
+        self.mapped_space_config = mapped_space
         self.progress = progress
+        self.cache_bytes = cache_bytes
         self._camera = camera
         self._device = device
-        self._given_mesh = mesh
         self._occlusion_models: dict[str, OcclusionModel] = {}
 
     @classmethod
@@ -120,20 +115,20 @@ class Scene:
         cls,
         files: ColmapFiles,
         camera: Camera | int | None = None,
-        occlusion: str | None = None,
-        config: SceneConfig = SceneConfig(),
+        occlusion_name: str | None = None,
         device: str = "cpu",
+        cache_bytes: int = 0,
     ) -> Scene:
         """Make the scene of a COLMAP model, with an occlusion model by name, or the most accurate one available.
 
         Raises ConfigError if the occlusion model is unknown or its files are missing.
         """
-        scene = cls(files, camera, config, device)
-        name = occlusion or scene.available_occlusion[0]
-        if occlusion is None and files.mesh is None and files.depth is None and (mesh := find_mesh(files.model)):
+        scene = cls(files, camera, device=device, cache_bytes=cache_bytes)
+        name = occlusion_name or scene.available_occlusion[0]
+        if occlusion_name is None and files.mesh is None and files.depth is None and (mesh := find_mesh(files.model)):
             LOG.info("mesh not used: %s; --mesh gives occlusion by it, if it is in the map's frame", mesh)
         scene.check_occlusion(name)
-        scene.config = replace(config, occlusion=replace(config.occlusion, model=name))
+        scene.given_occlusion = OcclusionConfig(name)
         return scene
 
     @property
@@ -200,7 +195,7 @@ class Scene:
         """Whether there is a mesh."""
         if isinstance(self.files, ColmapFiles):
             return self.files.mesh is not None
-        return self._given_mesh is not None or self.files.mesh.is_file()
+        return "mesh" in vars(self) or self.files.mesh.is_file()
 
     @property
     def has_depth(self) -> bool:
@@ -212,8 +207,6 @@ class Scene:
         """The mesh, of a COLMAP model with or without colours."""
         from wheretolook.scenes.loading import load_mesh
 
-        if self._given_mesh is not None:
-            return self._given_mesh
         if isinstance(self.files, SceneFolder):
             return load_mesh(self.files.mesh)
         assert self.files.mesh is not None
@@ -250,7 +243,7 @@ class Scene:
         """Where a camera can be according to the mesh; that of a COLMAP model is compared with the landmarks."""
         from wheretolook.space.free_space import FreeSpace
 
-        space = FreeSpace(self.mesh, self.config.free_space, self.device)
+        space = FreeSpace(self.mesh, self.free_space, self.device)
         if isinstance(self.files, ColmapFiles) and self.files.mesh is not None:
             warn_of_mesh(self.files.mesh, self.landmarks.points, space.raycaster)
         return space
@@ -261,7 +254,7 @@ class Scene:
         from wheretolook.space.mapped_space import MappedSpace
 
         poses = np.empty((0, 3, 4)) if self.map.mapping_poses is None else self.map.mapping_poses
-        return MappedSpace(self.landmarks.points, camera_centers(poses.astype(np.float64)), self.config.mapped_space)
+        return MappedSpace(self.landmarks.points, camera_centers(poses.astype(np.float64)), self.mapped_space_config)
 
     @cached_property
     def tsdf_space(self) -> FreeSpace:
@@ -269,14 +262,13 @@ class Scene:
         from wheretolook.space.free_space import TsdfSpace
 
         images = self.depth_images
-        return TsdfSpace(self.tsdf_volume, images, self.config.free_space, self.device, self.progress)
+        return TsdfSpace(self.tsdf_volume, images, self.free_space, self.device, self.progress)
 
     @cached_property
     def tsdf_volume(self) -> TsdfVolume:
         """The truncated signed distance field fused from the depth images."""
-        occlusion = self.config.occlusion
-        tsdf = TsdfConfig(voxel_size_m=occlusion.voxel_m, max_depth_m=occlusion.max_depth_m)
-        return TsdfVolume.from_images(self.depth_images, tsdf, self.progress)
+        config = self.given_occlusion
+        return TsdfVolume.from_images(self.depth_images, config.voxel_m, config.max_depth_m, self.progress)
 
     @property
     def sampled_space(self) -> FreeSpace | MappedSpace:
@@ -319,7 +311,7 @@ class Scene:
     @property
     def occlusion_config(self) -> OcclusionConfig:
         """The configured model, or hidden-point removal if that needs a mesh and a dataset's scene has photographs only."""
-        config = self.config.occlusion
+        config = self.given_occlusion
         replaced = OCCLUSION_MODELS[config.model].needs and self.is_photographed
         return replace(config, model="hidden-points") if replaced else config
 
@@ -329,14 +321,14 @@ class Scene:
         return self.occlusion_model(self.occlusion_config.model)
 
     def occlusion_model(self, name: str) -> OcclusionModel:
-        """Make the occlusion model of a name in `available_occlusion`, with the options of `config.occlusion`."""
+        """Make the occlusion model of a name in `available_occlusion`, with the options given."""
         if name not in self._occlusion_models:
             self.check_occlusion(name)
             model: OcclusionModel = resolve_name(OCCLUSION_MODELS[name].model).from_inputs(self)
-            if self.config.occlusion_cache_bytes and name != "none":
+            if self.cache_bytes and name != "none":
                 from wheretolook.visibility.occlusion import CachedOcclusion
 
-                model = CachedOcclusion(model, self.config.occlusion_cache_bytes)
+                model = CachedOcclusion(model, self.cache_bytes)
             self._occlusion_models[name] = model
         return self._occlusion_models[name]
 

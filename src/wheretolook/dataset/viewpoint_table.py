@@ -29,7 +29,6 @@ CHANGES = "changes"  # optional column
 
 UNLABELLED = "unlabelled"
 
-STATUSES = (LOCALIZED, TOO_FEW_MATCHES, NO_POSE)
 POSITIVE = tuple(f"positive_{threshold_key(threshold)}" for threshold in THRESHOLDS)
 """Columns of the shares of positives, from the finest threshold (the label) to the coarsest.
 
@@ -88,7 +87,7 @@ def label_shares(views: pd.DataFrame) -> pd.DataFrame:
     """Return shares of labels, in [0, 1], of `pooled_labels`: a row for each scene, then for each split, then for all.
 
     `scene` and `split` are `ALL` in rows over several. Columns: `n_views`, `n_locations`; the share of viewpoints of each
-    status (`STATUSES`) and without any pose (`without_pose`); of positives at each threshold (`POSITIVE`);
+    status and without any pose (`without_pose`); of positives at each threshold (`POSITIVE`);
     `locations_positive`, the share of locations with a positive at the finest; `finest_of_coarsest`, the share of the
     coarsest's positives that are positive at the finest; `same_label_share`, the share of viewpoints whose labels are
     all equal; `spearman`, the rank correlation of the finest and the coarsest label; median errors of the poses found
@@ -125,7 +124,7 @@ def _shares(views: pd.DataFrame) -> dict[str, Any]:
     return {
         "n_views": len(views),
         "n_locations": len(by_location),
-        **{status: (views["status"] == status).mean() for status in STATUSES},
+        **{status: (views["status"] == status).mean() for status in (LOCALIZED, TOO_FEW_MATCHES, NO_POSE)},
         "without_pose": views["error_m"].isna().mean(),
         **{name: views[name].mean() for name in POSITIVE},
         "locations_positive": by_location.mean(),

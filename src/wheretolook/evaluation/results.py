@@ -457,10 +457,9 @@ def log_evaluation(
     metrics |= {"n_locations": n_locations(views), "n_views": len(views), "positives": views.good[:, 0].mean()}
     tags = {"dataset": dataset.name, FINGERPRINT_TAG: mark, **best}
     with temporary_folder() as folder, start_run(tracking, ALL_METHODS, "evaluate", params, tags=tags) as (client, run):
-        log(client, run, metrics=metrics)
-        for file in results.iterdir():
-            if file.is_file() and file.suffix != ".partial":  # left by a killed process
-                client.log_artifact(run, str(file))
+        # others are left by a killed process
+        files = (file for file in results.iterdir() if file.is_file() and file.suffix != ".partial")
+        log(client, run, metrics=metrics, files=files)
         nested = _runs_with_locations(evaluation.scored, params, config, folder / "locations.parquet")
         log_nested(tracking, run, "evaluate", nested)
 

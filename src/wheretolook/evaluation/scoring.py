@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
 from wheretolook.dataset.layout import Dataset, SceneFolder, views_by_camera
-from wheretolook.dataset.scene import Scene, SceneConfig
+from wheretolook.dataset.scene import Scene
 from wheretolook.dataset.viewpoint_table import UNLABELLED, is_good, poses
 from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.evaluation.ranking import candidate_masks, check_labels, numbered, views_of
@@ -229,7 +229,7 @@ def _open_map(scene: SceneFolder, occlusion: OcclusionConfig | None, device: str
     # a release has no mesh, but stores visibility by it for each location
     if occlusion is None or not (scene.mesh.is_file() or occlusion.model != localization_map.occlusion.name):
         return localization_map
-    opened = Scene(scene, config=SceneConfig(occlusion), device=device, progress=progress)
+    opened = Scene(scene, occlusion_config=occlusion, device=device, progress=progress)
     return replace(localization_map, occlusion=opened.occlusion)
 
 

@@ -119,53 +119,51 @@ class Extractor:
 
 
 SIFT = DescriptorKind("sift", 128, "uint8", colmap_type=0)
-ALIKED = DescriptorKind("aliked", 128, "float16", min_similarity=0.8, colmap_type=1)
-DISK = DescriptorKind("disk", 128, "float16", min_similarity=0.8)
 XFEAT = DescriptorKind("xfeat", 64, "float16", min_similarity=0.82)
 # hloc's "NN-superpoint" matches up to a distance of 0.7 between unit descriptors: 1 - 0.7^2 / 2
 SUPERPOINT = DescriptorKind("superpoint", 256, "float16", min_similarity=0.755)
-# ALIKED of another network, and LoMa's descriptors by DeDoDe (Nordström et al. 2026), matched as COLMAP 4.2 does
-ALIKED_N32 = DescriptorKind("aliked-n32", 128, "float16", min_similarity=0.8, colmap_type=2)
-LOMA_B = DescriptorKind("loma-b", 256, "float16", min_similarity=0.85, colmap_type=3)
-LOMA_B128 = DescriptorKind("loma-b128", 128, "float16", min_similarity=0.85, colmap_type=4)
 
 EXTRACTORS = {
-    "opencv": Extractor("opencv", SIFT, "sift:OpenCvSift"),
-    "colmap": Extractor("colmap", SIFT, "sift:ColmapSift"),
-    "aliked": Extractor(
-        "aliked",
-        ALIKED,
-        build="learned:Aliked",
-        weights="aliked-n16rot.pth",
-        urls=(
-            "https://huggingface.co/kornia/aliked/resolve/main/aliked-n16rot.pth",
-            "https://github.com/Shiaoming/ALIKED/raw/main/models/aliked-n16rot.pth",
+    extractor.name: extractor
+    for extractor in (
+        Extractor("opencv", SIFT, "sift:OpenCvSift"),
+        Extractor("colmap", SIFT, "sift:ColmapSift"),
+        Extractor(
+            "aliked",
+            DescriptorKind("aliked", 128, "float16", min_similarity=0.8, colmap_type=1),
+            "learned:Aliked",
+            "aliked-n16rot.pth",
+            (
+                "https://huggingface.co/kornia/aliked/resolve/main/aliked-n16rot.pth",
+                "https://github.com/Shiaoming/ALIKED/raw/main/models/aliked-n16rot.pth",
+            ),
+            lightglue="aliked",
         ),
-        lightglue="aliked",
-    ),
-    "disk": Extractor(
-        "disk",
-        DISK,
-        build="learned:Disk",
-        weights="depth-save.pth",
-        urls=(
-            "https://huggingface.co/kornia/disk/resolve/main/depth-save.pth",
-            "https://raw.githubusercontent.com/cvlab-epfl/disk/master/depth-save.pth",
+        Extractor(
+            "disk",
+            DescriptorKind("disk", 128, "float16", min_similarity=0.8),
+            "learned:Disk",
+            "depth-save.pth",
+            (
+                "https://huggingface.co/kornia/disk/resolve/main/depth-save.pth",
+                "https://raw.githubusercontent.com/cvlab-epfl/disk/master/depth-save.pth",
+            ),
+            lightglue="disk",
         ),
-        lightglue="disk",
-    ),
-    "xfeat": Extractor(
-        "xfeat",
-        XFEAT,
-        build="learned:XFeat",
-        weights="xfeat.pt",
-        urls=("https://github.com/verlab/accelerated_features/raw/main/weights/xfeat.pt",),
-        lightglue="xfeat",
-    ),
-    "superpoint": Extractor("superpoint", SUPERPOINT, lightglue="superpoint"),
-    "aliked-n32": Extractor("aliked-n32", ALIKED_N32),
-    "loma-b": Extractor("loma-b", LOMA_B),
-    "loma-b128": Extractor("loma-b128", LOMA_B128),
+        Extractor(
+            "xfeat",
+            XFEAT,
+            "learned:XFeat",
+            "xfeat.pt",
+            ("https://github.com/verlab/accelerated_features/raw/main/weights/xfeat.pt",),
+            lightglue="xfeat",
+        ),
+        Extractor("superpoint", SUPERPOINT, lightglue="superpoint"),
+        # ALIKED of another network, and LoMa's descriptors by DeDoDe (Nordström et al. 2026), matched as by COLMAP 4.2
+        Extractor("aliked-n32", DescriptorKind("aliked-n32", 128, "float16", min_similarity=0.8, colmap_type=2)),
+        Extractor("loma-b", DescriptorKind("loma-b", 256, "float16", min_similarity=0.85, colmap_type=3)),
+        Extractor("loma-b128", DescriptorKind("loma-b128", 128, "float16", min_similarity=0.85, colmap_type=4)),
+    )
 }
 KINDS = {extractor.descriptors.name: extractor.descriptors for extractor in EXTRACTORS.values()}
 

@@ -183,7 +183,7 @@ def detect_and_describe(network: Any, images: Tensor) -> list[Detection]:
     image, pixels = _detected(network.dkd, scores)
     slot, counts = _slots(image, n_images)
     numbers = counts.tolist()
-    at = pixels.new_zeros((n_images, max(1, *numbers), 2))
+    at = pixels.new_zeros((n_images, max([1, *numbers]), 2))
     at[image, slot] = pixels
     places = 2 * at / torch.tensor([width - 1, height - 1], device=at.device) - 1
     keypoint_scores = F.grid_sample(scores, places[:, None], align_corners=True)[image, 0, 0, slot]

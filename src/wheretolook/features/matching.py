@@ -17,7 +17,6 @@ from wheretolook.utils.texts import LOG
 GROUP = 32  # landmarks; the best groups are selected first, and in them the best landmarks
 MAX_NEAREST = 16  # landmarks that `DescriptorMatcher.nearest` returns at most
 MISSING_PRODUCT = -(2**28)
-MISSING = 2**28  # squared distance
 # Size of a block of products. On a GPU, where each worker holds a block and its intermediate results, blocks of 1 GiB
 # are no faster. On a CPU blocks of 16 MiB, beyond its cache, take a tenth more.
 _PRODUCT_BYTES = {"cpu": 2**23, "cuda": 2**27}
@@ -51,7 +50,7 @@ class DescriptorMatcher:
     def nearest(self, descriptors: NDArray[np.uint8], count: int = 2) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Rows of the nearest landmarks of each descriptor (K, 128) and their squared distances, ascending; (K, count).
 
-        Ties are broken arbitrarily. With fewer landmarks, the missing ones have distances above `MISSING`.
+        Ties are broken arbitrarily. With fewer landmarks, the missing ones have squared distances above 2^28.
         """
         rows, products = self.products(descriptors, count)
         # of descriptors of length 512; rounding makes some a little longer, hence the maximum
@@ -241,7 +240,7 @@ class DescriptorIndex:
     def nearest(self, descriptors: NDArray[np.uint8], count: int = 2) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Rows of the nearest landmarks of each descriptor (K, 128) and their squared distances, ascending; (K, count).
 
-        Landmarks that the index does not find have the distance `MISSING`.
+        Landmarks that the index does not find have the squared distance 2^28.
         """
         _, proposed = self._index.search(descriptors.astype(np.float32), 64)  # candidates of each keypoint
         block = 256  # keypoints that are compared with their candidates at a time
@@ -253,7 +252,7 @@ class DescriptorIndex:
             queries = descriptors[start : start + block, :, None].astype(np.float32)
             products = (candidates @ queries)[..., 0].astype(np.int64)  # exact: 128 * 255^2 < 2^24
             # of descriptors of length 512; rounding makes some a little longer, hence the maximum
-            squared = np.where(rows < 0, MISSING, np.maximum(2 * (512**2 - products), 0))
+            squared = np.where(rows < 0, 2**28, np.maximum(2 * (512**2 - products), 0))
             order = np.argsort(squared, axis=1, kind="stable")[:, :count]
             parts.append(np.maximum(np.take_along_axis(rows, order, 1), 0))
             distances.append(np.take_along_axis(squared, order, 1))

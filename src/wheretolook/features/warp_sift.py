@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from wheretolook.features import warp_sift_kernels as kernels
 from wheretolook.features.extractor import ExtractorConfig, Keypoints
-from wheretolook.features.warp_sift_kernels import BORDER, KEYS_OF_IMAGE, LAYERS, LEVELS, MAX_SIDE
+from wheretolook.features.warp_sift_kernels import BORDER, LAYERS, LEVELS, MAX_SIDE
 from wheretolook.utils.warp import Staging, start_warp
 
 
@@ -72,7 +72,8 @@ class WarpSift:
         table, place, angle, places = self._orientations(space, keys)
         if len(place) == 0:
             return [Keypoints.none() for _ in range(n_images)]
-        image = (keys // KEYS_OF_IMAGE)[place]
+        keys_of_image = (1 << 14) ** 2 * 16 * 4  # `MAX_SIDE` squared, `MAX_OCTAVES` and `MAX_LAYERS`
+        image = (keys // keys_of_image)[place]
         order = _by_response(image, table[place], angle, self.device)
         ends = np.searchsorted(image, np.arange(n_images + 1))  # `image` is sorted to begin with
         order = order[np.arange(len(order)) - ends[image] < self.config.max_keypoints]

@@ -17,10 +17,9 @@ LEVELS = wp.constant(6)  # of the Gaussian in each octave
 BORDER = wp.constant(5)  # distance in pixels from an octave's border that is not searched for extrema
 SIGMA = wp.constant(1.6)  # of an octave's first level, in its pixels
 
-MAX_SIDE = wp.constant(1 << 14)  # rows or columns of a doubled image; this and the two below make up a key
+MAX_SIDE = wp.constant(1 << 14)  # rows or columns of a doubled image; with the two below it makes up a key
 MAX_OCTAVES = wp.constant(16)
 MAX_LAYERS = wp.constant(4)
-KEYS_OF_IMAGE = (1 << 14) ** 2 * 16 * 4
 
 
 @wp.struct

@@ -8,17 +8,14 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from numbers import Integral
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from wheretolook.geometry.poses import Float
+from wheretolook.geometry.poses import Float, angle_deg, unit
 from wheretolook.utils.errors import ConfigError, MapError, TableError, check_choice
 from wheretolook.utils.files import read_text, write_text
-
-if TYPE_CHECKING:
-    import pycolmap
 
 MAX_SIDE_PX = 10**6  # of an image; COLMAP's limit is not much higher
 MAX_PX = 1e12  # of a focal length or a principal point, so that products stay finite and huge integers are refused
@@ -138,7 +135,7 @@ class PinholeCamera(_Image):
         """Unit rays (..., 3) of pixels (..., 2) in the camera frame."""
         at = (np.asarray(pixels, dtype=np.float64) - (self.cx, self.cy)) / (self.fx, self.fy)
         rays = np.concatenate([at, np.ones_like(at[..., :1])], axis=-1)
-        return np.asarray(rays / np.linalg.norm(rays, axis=-1, keepdims=True))
+        return unit(rays)
 
 
 def _check_intrinsics(width: int, height: int, focal_px: tuple[float, ...]) -> None:
@@ -185,7 +182,7 @@ class ColmapCamera(_Image):
         _check_intrinsics(self.width, self.height, focal_px)
 
     @cached_property
-    def _camera(self) -> pycolmap.Camera:
+    def _camera(self) -> Any:
         import pycolmap
 
         return pycolmap.Camera(model=self.model, width=self.width, height=self.height, params=list(self.params))
@@ -229,8 +226,7 @@ class ColmapCamera(_Image):
         with np.errstate(all="ignore"):
             pixels = np.asarray(self._camera.img_from_cam(flat))
             rows = np.flatnonzero(self.in_image(pixels))
-            length = np.linalg.norm(flat[rows], axis=1, keepdims=True)
-            miss = np.linalg.norm(flat[rows] / length - self.unproject(pixels[rows]), axis=1)
+            miss = np.linalg.norm(unit(flat[rows]) - self.unproject(pixels[rows]), axis=1)
         pixels[rows[~(miss <= 1e-4)]] = np.nan  # chord, about radians
         return pixels.reshape(*points.shape[:-1], 2)
 
@@ -239,7 +235,7 @@ class ColmapCamera(_Image):
         at = np.asarray(pixels, dtype=np.float64)
         rays = np.asarray(self._camera.cam_ray_from_img(at.reshape(-1, 2)))
         with np.errstate(invalid="ignore"):
-            rays = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+            rays = unit(rays)
         return rays.reshape(*at.shape[:-1], 3)
 
     def sees(self, points_cam: ArrayLike) -> NDArray[np.bool_]:
@@ -295,8 +291,8 @@ def turn_camera(camera: Camera, quarters: int) -> Camera:
     return camera
 
 
-def mean_focal_px(camera: pycolmap.Camera) -> float:
-    """Mean focal length in pixels; of a panorama, pixels per radian across."""
+def mean_focal_px(camera: Any) -> float:
+    """Mean focal length of a `pycolmap.Camera` in pixels; of a panorama, pixels per radian across."""
     if len(camera.focal_length_idxs()) == 0:
         return float(camera.width / (2 * np.pi))
     return float(camera.mean_focal_length())
@@ -411,7 +407,7 @@ def field_of_view_deg(camera: Camera) -> tuple[float, float]:
     h = camera.height
     ends = np.array([[0, h / 2], [w, h / 2], [w / 2, 0], [w / 2, h]])
     middle = camera.unproject([w / 2, h / 2])
-    angles = np.degrees(np.arccos(np.clip(camera.unproject(ends) @ middle, -1, 1)))
+    angles = angle_deg(camera.unproject(ends) @ middle)
     return float(angles[0] + angles[1]), float(angles[2] + angles[3])
 
 

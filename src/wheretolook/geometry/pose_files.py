@@ -23,6 +23,7 @@ from numpy.typing import ArrayLike
 
 from wheretolook.geometry.poses import (
     Float,
+    are_rotations,
     camera_centers,
     invert_poses,
     quaternion_from_rotation,
@@ -40,10 +41,13 @@ FORMATS = (
     "COLMAP's images.txt, images.bin or folder, or JSON as select writes it; lines that start with # are comments"
 )
 NAME_COLUMNS = ("image", "id", "waypoint", "name", "t", "timestamp")
-_TUM_ORDER = (*TRANSLATION_COLUMNS, "qx", "qy", "qz", "qw")
 _IMAGE_COLUMNS = ("image_id", *POSE_COLUMNS, "camera_id", "name")
-_SYNONYMS = {"label": "image", "filename": "image", "file_name": "image", "image_name": "image"}
-_SYNONYMS |= {"x/easting": "x", "y/northing": "y", "z/altitude": "z", "easting": "x", "northing": "y", "altitude": "z"}
+_SYNONYMS = {
+    **dict.fromkeys(("label", "filename", "file_name", "image_name"), "image"),
+    **dict.fromkeys(("x/easting", "easting"), "x"),
+    **dict.fromkeys(("y/northing", "northing"), "y"),
+    **dict.fromkeys(("z/altitude", "altitude"), "z"),
+}
 MAX_ROWS = 500_000  # of a table
 CAM_FROM_BASE = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])  # a camera that looks along x of a body whose z is up
 
@@ -222,10 +226,10 @@ def _without_names(path: Path, rows: list[tuple[int, list[str]]], of_cameras: bo
     """Recognize rows without names of their columns by the number of cells, unit quaternions and rotations."""
     n = len(rows[0][1])
     if n == 4 and all(_is_number(cells[0]) for _, cells in rows):
-        first = NamedRows(path, ("id", *"xyz"), rows).numbers(["id"])[:, 0]
-        if (np.diff(first) <= 0).any() and (
-            (first % 1).any() or len({*first}) < len(first)
-        ):  # neither times nor numbers
+        ids = NamedRows(path, ("id", *"xyz"), rows).numbers(["id"])[:, 0]
+        is_time = (np.diff(ids) > 0).all()
+        is_number = not (ids % 1).any() and len({*ids}) == len(ids)
+        if not is_time and not is_number:
             fix = "Start the file with '# x y z yaw_deg' or '# id x y z'."
             problem = "four columns of numbers do not show whether they are id x y z, or x y z and a yaw"
             raise TableError(problem, path=path, value=" ".join(rows[0][1])[:80], fix=fix)
@@ -261,8 +265,7 @@ def _matrix_rows(path: Path, rows: list[tuple[int, list[str]]]) -> NamedRows:
     values = NamedRows(path, ("t",) * named + columns, rows).numbers(columns)
     poses = values[:, :12].reshape(-1, 3, 4)
     rotations = poses[:, :, :3]
-    off = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
-    rigid = (off < 0.01) & (np.linalg.det(rotations) > 0) & (values[:, 12:] == (0, 0, 0, 1)[: n - named - 12]).all(1)
+    rigid = are_rotations(rotations, 0.01) & (values[:, 12:] == (0, 0, 0, 1)[: n - named - 12]).all(1)
     for row in np.flatnonzero(~rigid).tolist():
         value = f"line {rows[row][0]}: {' '.join(rows[row][1])[:80]}"
         raise TableError("a matrix is no rotation and translation", path=path, value=value, fix=f"Give {FORMATS}.")
@@ -356,9 +359,10 @@ def holds_cam_from_world(table: NamedRows) -> bool:
     if not {*POSE_COLUMNS} <= {*table.columns}:
         return False
     order = tuple(sorted(POSE_COLUMNS, key=lambda name: table.columns[name]))
-    if order not in (POSE_COLUMNS, _TUM_ORDER):
+    tum = (*TRANSLATION_COLUMNS, "qx", "qy", "qz", "qw")
+    if order not in (POSE_COLUMNS, tum):
         problem = "the order of the columns does not show whether poses are camera-to-world or world-to-camera"
-        fix = f"Order them as TUM, {','.join(_TUM_ORDER)}, camera-to-world, or COLMAP, {','.join(POSE_COLUMNS)}, world-to-camera."
+        fix = f"Order them as TUM, {','.join(tum)}, camera-to-world, or COLMAP, {','.join(POSE_COLUMNS)}, world-to-camera."
         raise TableError(problem, path=table.path, value=",".join(order), fix=fix)
     return order == POSE_COLUMNS
 
@@ -406,8 +410,8 @@ def pose_texts(cam_from_world: ArrayLike, exact: bool = False) -> list[str]:
     """
     values = pose_values(cam_from_world)
     decimals = 9 if np.abs(values[:, 4:]).max(initial=0) < 1000.0 else 15
-    pattern = ["{!r}"] * 7 if exact else [f"{{:.{decimals}f}}"] * 4 + ["{:.9f}"] * 3
-    return [" ".join(pattern).format(*row) for row in values.tolist()]
+    digits = [""] * 7 if exact else [f".{decimals}f"] * 4 + [".9f"] * 3
+    return [" ".join(map(format, row, digits)) for row in values.tolist()]
 
 
 def tum_text(stamps: Iterable[str], cam_from_world: ArrayLike) -> str:

@@ -21,8 +21,6 @@ from numpy.typing import ArrayLike
 from wheretolook.geometry.poses import Float
 
 N_NUMBERS = 15  # numbers that a sum of information matrices is kept as
-TRACE = np.zeros(N_NUMBERS)  # weights (15,) whose product with the numbers is the trace
-TRACE[[0, 3, 5, 9, 12, 14]] = 1
 
 PRIOR = 1e-3
 """Information on each coordinate of a pose without any landmark: keeps the covariance finite (1/m^2 and 1/rad^2 for a

@@ -133,6 +133,21 @@ def as_numbers(values: ArrayLike) -> NDArray[np.float64]:
         raise PoseError(f"these are no numbers: {error}") from error
 
 
+def unit(vectors: Float) -> Float:
+    """Return vectors (..., 3) scaled to unit length."""
+    return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))
+
+
+def angle_deg(cosine: ArrayLike) -> Float:
+    """Return angles in degrees of cosines, which rounding may have moved beyond -1 or 1."""
+    return np.degrees(np.arccos(np.clip(cosine, -1, 1)))
+
+
+def as_points(values: ArrayLike) -> NDArray[np.float64]:
+    """Return points as float64 (N, 3); one point (3,) is N = 1."""
+    return np.asarray(values, dtype=np.float64).reshape(-1, 3)
+
+
 def check_poses(cam_from_world: ArrayLike) -> NDArray[np.float64]:
     """The poses as float64 (B, 3, 4). Raises PoseError, a ValueError, on another shape or entries not finite or too large."""
     poses = as_numbers(cam_from_world)
@@ -142,6 +157,13 @@ def check_poses(cam_from_world: ArrayLike) -> NDArray[np.float64]:
     if len(invalid):
         raise PoseError(f"pose {invalid[0]} has NaN, infinite or too large entries", value=poses[invalid[0]].tolist())
     return poses
+
+
+def are_rotations(matrices: Float, tolerance: float = 1e-5) -> NDArray[np.bool_]:
+    """Whether matrices R (..., 3, 3) are rotations: entries of R R^T are within a tolerance of 1 and 0, none is mirrored."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        off = np.abs(matrices @ np.swapaxes(matrices, -1, -2) - np.eye(3)).max((-2, -1))
+        return np.asarray((off <= tolerance) & (np.linalg.det(matrices) > 0))
 
 
 def rigid_poses(poses: ArrayLike) -> NDArray[np.float64]:
@@ -154,9 +176,7 @@ def rigid_poses(poses: ArrayLike) -> NDArray[np.float64]:
         matrices = matrices[None]
     homogeneous = matrices.ndim == 3 and matrices.shape[1:] == (4, 4)
     checked = check_poses(matrices[:, :3] if homogeneous else matrices)
-    rotation = checked[:, :, :3]
-    off = np.abs(rotation @ np.swapaxes(rotation, 1, 2) - np.eye(3)).max((1, 2))
-    rigid = (off < 1e-3) & (np.linalg.det(rotation) > 0)
+    rigid = are_rotations(checked[:, :, :3], 1e-3)
     if homogeneous:
         rigid &= (matrices[:, 3] == (0, 0, 0, 1)).all(1)
     for row in np.flatnonzero(~rigid):
@@ -222,7 +242,7 @@ def turns_from_deg(current: ArrayLike, rotations: Float) -> Float:
     given: Float = np.asarray(current, dtype=np.float64)
     if given.shape == (3,):
         given = rotation_looking_along(check_axis(given))
-    if given.shape != (3, 3) or not np.allclose(given @ given.T, np.eye(3), atol=1e-6) or np.linalg.det(given) < 0:
+    if given.shape != (3, 3) or not are_rotations(given):
         raise ValueError(f"an orientation is an axis (3,) or a rotation (3, 3), got {given}")
     return _angles_deg(given.reshape(1, 9), rotations.reshape(-1, 9))[0]
 

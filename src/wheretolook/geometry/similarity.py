@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from wheretolook.geometry.poses import Float
+from wheretolook.geometry.poses import Float, as_points
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +48,7 @@ class Similarity:
 
 def local_origin(points: ArrayLike) -> Float:
     """Return the median (3,) of the finite points among (N, 3) m, rounded to 100 m: 0 for most scenes."""
-    at = np.asarray(points, dtype=np.float64).reshape(-1, 3)
+    at = as_points(points)
     at = at[np.isfinite(at).all(1)]
     center = np.median(at, axis=0) if len(at) else np.zeros(3)
     return np.asarray(np.round(center / 100.0) * 100.0 + 0.0)  # no -0.0

@@ -15,39 +15,15 @@ from tqdm.auto import tqdm
 
 from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.mesh import TexturedMesh
-from wheretolook.geometry.poses import Float, camera_centers, check_poses
+from wheretolook.geometry.poses import Float, are_rotations, camera_centers, check_poses
 from wheretolook.geometry.similarity import local_origin, poses_from
 from wheretolook.utils.devices import fitting
-from wheretolook.utils.errors import ConfigError, SceneError, check_positive, check_range
+from wheretolook.utils.errors import ConfigError, SceneError, check_positive
 
 BLOCK_VOXELS = 8  # voxels along the side of a block
-
-
-@dataclass(frozen=True)
-class TsdfConfig:
-    """How depth images are fused.
-
-    Args:
-        voxel_size_m: distance between two samples of the distance field. At 2 cm, precision and recall against a mesh
-            were 0.97 to 0.997, at 1 cm 0.98 and more. What is thinner than about two voxels is rounded off or lost.
-        truncation_voxels: how far behind a surface space counts as inside it, in voxels. The two faces of a wall
-            thinner than twice this blur each other, so it should be small; below about 1.5, gaps open.
-        max_depth_m: farther readings are left out, as those of most depth cameras are too noisy there.
-    """
-
-    voxel_size_m: float = 0.02
-    truncation_voxels: float = 2.0
-    max_depth_m: float = 10.0
-
-    def __post_init__(self) -> None:
-        check_positive("tsdf.voxel_size_m", self.voxel_size_m)
-        check_positive("tsdf.max_depth_m", self.max_depth_m)
-        check_range("tsdf.truncation_voxels", self.truncation_voxels, 1)
-
-    @property
-    def block_m(self) -> float:
-        """Side of a block of voxels in metres."""
-        return BLOCK_VOXELS * self.voxel_size_m
+_TRUNCATION_VOXELS = 2.0
+"""How far behind a surface space counts as inside it. The two faces of a wall thinner than twice this blur each other, so
+it should be small; below about 1.5, gaps open."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +49,7 @@ class DepthImage:
             fix = "Divide a 16-bit image by its depth scale, mostly 1000 a metre."
             raise ConfigError("a depth image must hold floats, in metres", value=str(dtype), fix=fix)
         rotation = check_poses([self.cam_from_world])[0, :, :3]
-        if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) or np.linalg.det(rotation) < 0:
+        if not are_rotations(rotation, 1e-3):
             raise ConfigError("cam_from_world of a depth image must hold a rotation", value=rotation.tolist())
 
     def readings(self, max_depth_m: float, stride: int = 1) -> NDArray[np.float32]:
@@ -106,37 +82,53 @@ class TsdfVolume:
 
     Use `from_images` where all images are at hand: it also checks the memory beforehand.
 
-    It starts with room for `expected_blocks`; when they are used up, all are copied to more. Open3D works in single
-    precision, about `origin` (3,) m.
+    Args:
+        voxel_size_m: distance between two samples of the distance field. At 2 cm, precision and recall against a mesh
+            were 0.97 to 0.997, at 1 cm 0.98 and more. What is thinner than about two voxels is rounded off or lost.
+        max_depth_m: farther readings are left out, as those of most depth cameras are too noisy there.
+        expected_blocks: room at the start; when it is used up, all blocks are copied to more.
+        origin: (3,) m, about which Open3D computes in single precision.
+
+    Raises:
+        ConfigError: the voxel size or the depth is not positive and finite.
     """
 
     def __init__(
-        self, config: TsdfConfig = TsdfConfig(), expected_blocks: int = 1 << 13, origin: ArrayLike = (0.0, 0.0, 0.0)
+        self,
+        voxel_size_m: float = 0.02,
+        max_depth_m: float = 10.0,
+        expected_blocks: int = 1 << 13,
+        origin: ArrayLike = (0.0, 0.0, 0.0),
     ) -> None:
         import open3d as o3d
 
-        self.config = config
+        check_positive("tsdf.voxel_size_m", voxel_size_m)
+        check_positive("tsdf.max_depth_m", max_depth_m)
+        self.voxel_size_m = voxel_size_m
+        self.max_depth_m = max_depth_m
         self.origin = np.asarray(origin, dtype=np.float64)
         self._max_blocks = _max_blocks()
         self._grid: Any = o3d.t.geometry.VoxelBlockGrid(
             ("tsdf", "weight"),
             (o3d.core.float32, o3d.core.float32),
             [o3d.core.SizeVector([1]), o3d.core.SizeVector([1])],
-            config.voxel_size_m,
+            voxel_size_m,
             BLOCK_VOXELS,
             expected_blocks,
         )
 
     @classmethod
-    def from_images(cls, images: DepthImages, config: TsdfConfig = TsdfConfig(), progress: bool = True) -> TsdfVolume:
+    def from_images(
+        cls, images: DepthImages, voxel_size_m: float = 0.02, max_depth_m: float = 10.0, progress: bool = True
+    ) -> TsdfVolume:
         """Fuse depth images, in any order. A sequence that reads each from disk when asked for it keeps memory low.
 
         Raises a ConfigError if the voxels would not fit the memory (found before the fusion, from a sample of the
         images), a SceneError if there is no image, or none of the sampled ones has a reading.
         """
-        n_blocks = estimate_blocks(images, config)
-        _check_memory(n_blocks, config, _max_blocks())
-        volume = cls(config, n_blocks, _origin_of(images))
+        n_blocks = estimate_blocks(images, voxel_size_m, max_depth_m)
+        _check_memory(n_blocks, voxel_size_m, _max_blocks())
+        volume = cls(voxel_size_m, max_depth_m, n_blocks, _origin_of(images))
         for i in tqdm(range(len(images)), desc="fuse depth", unit="image", disable=not progress):
             volume.integrate(images[i])
         return volume
@@ -150,7 +142,7 @@ class TsdfVolume:
         import open3d as o3d
 
         tensor: Any = o3d.core.Tensor
-        depth = image.readings(self.config.max_depth_m)
+        depth = image.readings(self.max_depth_m)
         rows, columns = (side // 4 * 4 for side in depth.shape)  # Open3D looks for blocks at every fourth pixel
         if not depth[:rows:4, :columns:4].any():
             return  # Open3D would raise
@@ -160,12 +152,12 @@ class TsdfVolume:
             "intrinsic": tensor(image.camera.matrix),
             "extrinsic": tensor(pose),
             "depth_scale": 1.0,
-            "depth_max": float(self.config.max_depth_m),
-            "trunc_voxel_multiplier": float(self.config.truncation_voxels),
+            "depth_max": float(self.max_depth_m),
+            "trunc_voxel_multiplier": _TRUNCATION_VOXELS,
         }
         blocks = self._grid.compute_unique_block_coordinates(shown, **view)
         self._grid.integrate(blocks, shown, **view)
-        _check_memory(len(self), self.config, self._max_blocks)
+        _check_memory(len(self), self.voxel_size_m, self._max_blocks)
 
     def surface(self) -> TexturedMesh:
         """The zero crossing as triangles, whose fronts face the cameras that saw them, of all voxels with a reading.
@@ -178,7 +170,7 @@ class TsdfVolume:
         if len(self) == 0:
             raise nothing
         # Shifting the field moves the crossing outwards, towards the cameras.
-        shift = 0.1 / self.config.truncation_voxels  # averaging views at a slant rounds edges off by a tenth of a voxel
+        shift = 0.1 / _TRUNCATION_VOXELS  # averaging views at a slant rounds edges off by a tenth of a voxel
         values = self._grid.attribute("tsdf").numpy()  # shares its memory
         values -= shift
         try:
@@ -196,23 +188,24 @@ class TsdfVolume:
         return TexturedMesh(mesh.vertex.positions.numpy(), triangles, uvs, texture, white, origin=self.origin)
 
 
-def estimate_blocks(images: DepthImages, config: TsdfConfig) -> int:
+def estimate_blocks(images: DepthImages, voxel_size_m: float, max_depth_m: float) -> int:
     """Blocks of voxels that the images' surfaces will touch, from some pixels of up to 100; SceneError without any."""
-    cell_m = max(config.block_m, 0.16)  # pixels this sparse do not show smaller blocks
+    block_m = BLOCK_VOXELS * voxel_size_m
+    cell_m = max(block_m, 0.16)  # pixels this sparse do not show smaller blocks
     cells = np.empty(0, dtype=np.int64)
     number = np.array([1, 1 << 21, 1 << 42])  # one number a cell sorts faster than three
     sampled = {int(i) for i in np.linspace(0, len(images) - 1, 100)} if len(images) else ()
     for image in (images[i] for i in sampled):
         stride = max(1, int(np.sqrt(np.size(image.depth_m) / 5000)))  # about 5,000 pixels of each
-        points = image.points(config.max_depth_m, stride) - _origin_of(images)
+        points = image.points(max_depth_m, stride) - _origin_of(images)
         cells = np.union1d(cells, np.floor(points / cell_m).astype(np.int64) @ number)
     if len(cells) == 0:
-        problem = f"no depth image has a reading up to {config.max_depth_m:g} m"
+        problem = f"no depth image has a reading up to {max_depth_m:g} m"
         fix = "Check that depths are in metres and that max_depth_m is large enough."
         raise SceneError(problem, value=f"{len(images)} images", fix=fix)
     # The number of blocks that a surface touches grows with its area.
     # Surfaces also touch neighbouring blocks: 1.3 to 1.7 were measured.
-    return int(np.ceil(1.7 * len(cells) * (cell_m / config.block_m) ** 2))
+    return int(np.ceil(1.7 * len(cells) * (cell_m / block_m) ** 2))
 
 
 def _origin_of(images: DepthImages) -> Float:
@@ -227,10 +220,10 @@ def _max_blocks() -> int:
     return min(fitting(24 * 1024), 1 << 20)
 
 
-def _check_memory(n_blocks: int, config: TsdfConfig, max_blocks: int) -> None:
+def _check_memory(n_blocks: int, voxel_size_m: float, max_blocks: int) -> None:
     """Raise ConfigError if there are more blocks than fit."""
     if n_blocks > max_blocks:
-        enough = config.voxel_size_m * np.sqrt(n_blocks / max(max_blocks, 1))
+        enough = voxel_size_m * np.sqrt(n_blocks / max(max_blocks, 1))
         problem = f"the depth images need {n_blocks:,} blocks of voxels, {max_blocks:,} fit into memory"
         fix = f"A voxel_size_m of {1.1 * enough:.2g} would fit."
-        raise ConfigError(problem, value=f"voxel_size_m={config.voxel_size_m:g}", fix=fix)
+        raise ConfigError(problem, value=f"voxel_size_m={voxel_size_m:g}", fix=fix)

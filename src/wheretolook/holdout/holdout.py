@@ -27,6 +27,7 @@ from wheretolook.holdout.photo_map import MAX_ERROR_DEG, MAX_ERROR_M, Photograph
 from wheretolook.localization.config import LocalizerConfig, versions
 from wheretolook.localization.localizer import Localizer, localization_errors
 from wheretolook.mapping.colmap_model import observation_matrix, read_model, write_model
+from wheretolook.mapping.config import MIN_TRIANGULATION_ANGLE_DEG
 from wheretolook.mapping.feature_files import read_features
 from wheretolook.mapping.landmarks import Landmarks, load_colmap_landmarks
 from wheretolook.utils.errors import MapError, MapWarning
@@ -34,9 +35,8 @@ from wheretolook.utils.files import ArtifactCache, cache_key
 from wheretolook.utils.processes import WorkerPool
 
 KEPT = tuple(LocalizerConfig().min_inliers * share for share in (16, 8, 4, 2))
-"""Landmarks that the rest may still have of what a photograph observes, at the quantile `COVERED_WORSE` of each grown
-block: from plenty for a pose to hardly enough, since not all are matched again."""
-COVERED_WORSE = 0.25
+"""Landmarks that the rest may still have of what a photograph observes, at the lower quartile of each grown block: from
+plenty for a pose to hardly enough, since not all are matched again."""
 MIN_REST = 0.1  # share of the photographs that is never held out
 MIN_LANDMARKS = 50  # of a map without a block
 VIEWS = 60  # maximum number of photographs of a block that are localized; then evenly spread ones
@@ -168,7 +168,7 @@ def _block_size(observes: csr_array, order: NDArray[np.int64], kept: float) -> i
     high = max(2, int((1 - MIN_REST) * len(order)))
     while low < high:  # the larger the block, the less is left
         middle = (low + high) // 2
-        if np.quantile(landmarks_kept(observes, order[:middle]), COVERED_WORSE) <= kept:
+        if np.quantile(landmarks_kept(observes, order[:middle]), 0.25) <= kept:
             high = middle
         else:
             low = middle + 1
@@ -188,9 +188,6 @@ def _remaining(observes: csr_array, group: NDArray[np.int64]) -> NDArray[np.floa
 
 def _landmarks_without(observes: csr_array, group: NDArray[np.int64]) -> int:
     return int(_remaining(observes, group).sum())
-
-
-MIN_ANGLE_DEG = 1.5  # COLMAP's own minimum angle between the rays of a landmark
 
 
 @dataclass(frozen=True, eq=False)
@@ -232,7 +229,13 @@ def hold_out_blocks(
     `MapWarning`. Raises MapError if fewer than two remain.
     """
     blocks = choose_blocks(source) if blocks is None else blocks
-    limits = [source.limit_m.tolist(), MAX_ERROR_DEG, MIN_ANGLE_DEG, asdict(LocalizerConfig()), source.fov_deg]
+    limits = [
+        source.limit_m.tolist(),
+        MAX_ERROR_DEG,
+        MIN_TRIANGULATION_ANGLE_DEG,
+        asdict(LocalizerConfig()),
+        source.fov_deg,
+    ]
     key = cache_key(4, versions(), source.key, limits)  # version of what is cached of a block
     folder = work / f"blocks-{key}"
     for old in work.glob("blocks-*"):
@@ -278,7 +281,7 @@ def without(model: Any, image_ids: Sequence[int]) -> Any:
     """Return a copy of a `pycolmap.Reconstruction` without some images and their influence on its landmarks.
 
     The frames of these images are removed with all their images. A landmark that loses an observation is triangulated
-    again from the others; it is dropped if it has fewer than two, if its rays meet at less than `MIN_ANGLE_DEG`, or if
+    again from the others; it is dropped if it has fewer than two, if its rays meet at less than `MIN_TRIANGULATION_ANGLE_DEG`, or if
     it reprojects worse than any landmark of the whole map.
     """
     rest = pycolmap.Reconstruction(model)
@@ -297,7 +300,8 @@ def without(model: Any, image_ids: Sequence[int]) -> Any:
     options.ceres.solver_options.num_threads = 1
     pycolmap.create_default_bundle_adjuster(options, adjusting, rest).solve()
     rest.update_point_3d_errors()
-    pycolmap.ObservationManager(rest).filter_points3D_with_small_triangulation_angle(MIN_ANGLE_DEG, set(changed))
+    observations = pycolmap.ObservationManager(rest)
+    observations.filter_points3D_with_small_triangulation_angle(MIN_TRIANGULATION_ANGLE_DEG, set(changed))
     for number in changed:
         if number in rest.points3D:
             point = rest.points3D[number]
@@ -322,8 +326,7 @@ def _run(job: _BlockJob) -> int:
     rest = without(whole, image_ids[job.block.held_out].tolist())
     if rest.num_points3D() < MIN_LANDMARKS:
         return int(rest.num_points3D())
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", MapWarning)
+    with warnings.catch_warnings(action="ignore", category=MapWarning):
         landmarks = load_colmap_landmarks(job.model, job.source.features, None, job.device, rest, progress=False)
     observed = [
         _observed(whole.images[int(image_ids[row])], job.source, row, crop)

@@ -19,14 +19,7 @@ from wheretolook.geometry.camera import Camera, PinholeCamera, cameras_by_id, fi
 from wheretolook.geometry.poses import Float, camera_centers
 from wheretolook.geometry.similarity import Similarity
 from wheretolook.localization.config import versions
-from wheretolook.mapping.colmap_model import (
-    ModelArrays,
-    compact_poses,
-    model_arrays,
-    read_model,
-    registered_names,
-    select_points,
-)
+from wheretolook.mapping.colmap_model import ModelArrays, compact_poses, model_arrays, read_model, registered_names
 from wheretolook.mapping.config import FrameOptions, ImportConfig, place_name
 from wheretolook.mapping.feature_files import DATABASE_FILE, read_descriptors
 from wheretolook.mapping.georeference import DEPTH_M, median_depths
@@ -69,7 +62,6 @@ def crop_pixels(camera: Camera, pixels: Float, fov_deg: float, crop: int) -> tup
 
 
 MAX_ERROR_M, MAX_ERROR_DEG = THRESHOLDS[0]  # below both, a photograph counts as localized
-MIN_PHOTOGRAPHS = 8  # with fewer, blocks are too small
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,15 +122,14 @@ class PhotographedMap:
     @cached_property
     def map(self) -> Map:
         """The whole map, which scorers use."""
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", MapWarning)
+        with warnings.catch_warnings(action="ignore", category=MapWarning):
             landmarks = load_colmap_landmarks(self.path, self.features, reconstruction=self.model, arrays=self.arrays)
         return Map(
             landmarks,
             compact_poses(self.poses),
             has_photographs=self.photographs,
             cameras=dict(zip(self.arrays.image_cameras.tolist(), self.cameras, strict=True)),
-            images=select_points(self.arrays, np.isin(self.arrays.point_ids, landmarks.ids)),
+            images=self.arrays.of_points(landmarks.ids),
         )
 
     @property
@@ -190,7 +181,7 @@ def open_map(
 
     Raises:
         MapError: the model or the features cannot be used or do not belong together, the features are of an unknown
-            kind, or the model has fewer than `MIN_PHOTOGRAPHS` photographs.
+            kind, or the model has fewer than 8 photographs.
     """
     model = read_model(model_dir)
     _check_photographs(model, model_dir)
@@ -211,8 +202,7 @@ def open_map(
     if to_frame.record() != IDENTITY.world_from_map.record():
         to_frame.transform_model(model)
         arrays = model_arrays(model)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", MapWarning)  # the error below replaces it
+    with warnings.catch_warnings(action="ignore", category=MapWarning):  # the error below replaces it
         if read_descriptors(features, model, arrays) is None:
             fix = "Give hloc's feats-*.h5, --database, or the folder of its photographs, --images, to extract features."
             raise MapError("there are no descriptors of a known kind", path=features, fix=fix)
@@ -236,8 +226,8 @@ def open_map(
 
 def _check_photographs(model: Any, model_dir: Path) -> None:
     n_posed = sum(image.has_pose for image in model.images.values())
-    if n_posed < MIN_PHOTOGRAPHS:
-        problem = f"a check needs at least {MIN_PHOTOGRAPHS} photographs"
+    if n_posed < 8:  # blocks would be too small
+        problem = "a check needs at least 8 photographs"
         fix = "Take more photographs, and map them all."
         raise MapError(problem, path=model_dir, value=n_posed, fix=fix)
 
@@ -280,8 +270,7 @@ def features_of(
     shutil.rmtree(out, ignore_errors=True)
     own = FrameOptions(scale=1, up="z")
     config = ImportConfig(images, model=model_dir, frame=own, extractor=extractor, keep_database=True)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", MapWarning)  # about the frame, which `open_map` corrects
+    with warnings.catch_warnings(action="ignore", category=MapWarning):  # about the frame, which `open_map` corrects
         map_existing(config, out, work / "photographs", workers=workers, device=device, reconstruction=model)
     cache.store()
     return out, out / DATABASE_FILE

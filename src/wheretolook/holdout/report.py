@@ -110,9 +110,6 @@ def weak_parts(source: PhotographedMap, results: list[HoldoutResult], views: pd.
     return [replace(part, number=number) for number, part in enumerate(parts, 1)]
 
 
-MAX_PRINTED = 5  # all are in the files
-
-
 @dataclass(frozen=True, eq=False)
 class CheckReport:
     """All results of a check.
@@ -234,11 +231,10 @@ class CheckReport:
         if not self.parts:
             return [*lines, "no part of the map fails without its neighbours"]
         lines.append(f"photograph again ({len(self.parts)} parts relocalize badly, {source.frame.unit}):")
-        lines += [
-            f"  {part.number}. {part.describe(source.names, source.frame.unit)}" for part in self.parts[:MAX_PRINTED]
-        ]
-        if len(self.parts) > MAX_PRINTED:
-            lines.append(f"  and {len(self.parts) - MAX_PRINTED} more: column part of check.csv")
+        printed = self.parts[:5]  # all are in the files
+        lines += [f"  {part.number}. {part.describe(source.names, source.frame.unit)}" for part in printed]
+        if self.parts != printed:
+            lines.append(f"  and {len(self.parts) - len(printed)} more: column part of check.csv")
         return lines
 
 

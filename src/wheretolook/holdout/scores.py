@@ -83,8 +83,7 @@ def check_place(source: PhotographedMap, scoring: Scoring, device: str) -> None:
     """
     chosen = scoring.chosen
     if chosen is not None and method_of_weights(chosen) == "adapted" and not scoring.anywhere:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", MapWarning)
+        with warnings.catch_warnings(action="ignore", category=MapWarning):
             landmarks = load_colmap_landmarks(source.path, reconstruction=source.model, progress=False)
         whole = Map(landmarks, has_photographs=source.photographs)
         scoring.scorer(LocalizationMap(whole, source.cameras[0], device=device))
@@ -144,8 +143,7 @@ def _score(
     localization_map: LocalizationMap, poses: Float, scoring: Scoring
 ) -> tuple[str, dict[str, NDArray[np.generic]]]:
     """Score poses (B, 3, 4) by all methods; returns the checked method's name, and columns (B,)."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", OutOfRangeWarning)  # the column in_range reports them
+    with warnings.catch_warnings(action="ignore", category=OutOfRangeWarning):  # the column in_range reports them
         scorer = scoring.scorer(localization_map, anywhere=True)  # `check_place` has been called
         report = scorer.report(poses)
         columns: dict[str, NDArray[np.generic]] = {

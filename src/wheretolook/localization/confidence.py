@@ -59,11 +59,6 @@ class LogisticRegression:
         return np.asarray(1 / (1 + np.exp(-np.clip(features @ np.asarray(self.weights) + self.bias, -60, 60))))
 
 
-FEATURE_NAMES = ("log_elsewhere", "log_share", "log_own", "log_deviation_deg")
-"""log(1 + support of the best competing pose), log of the inlier ratio of the matches, log of the ratio of this pose's
-unique support to that of its strongest rival (`log_ratio`), log of one standard deviation of the
-orientation (degrees)."""
-
 RIGHT_PLACE: Accuracy = (math.inf, math.inf)
 """Accuracy that every pose at the right place has: within `RIGHT_PLACE_LIMITS` of the true one."""
 
@@ -86,7 +81,7 @@ def confidence_features(
     rival_unique_support: ArrayLike,
     deviation_deg: ArrayLike,
 ) -> Float:
-    """`FEATURE_NAMES` (B, 4) of B joint poses."""
+    """Features (B, 4) of B joint poses, see `ConfidenceModel`."""
     inlier_ratio = (np.asarray(n_inliers, dtype=np.float64) + 0.5) / (np.asarray(n_matches, dtype=np.float64) + 1)
     deviation = np.clip(np.asarray(deviation_deg, dtype=np.float64), 1e-4, 10.0)
     support_ratio = log_ratio(unique_support, rival_unique_support)
@@ -116,7 +111,10 @@ class ErrorModel:
 class ConfidenceModel(LogisticRegression):
     """Probability that a pose is right within an accuracy; 0 with fewer inliers than `MIN_INLIERS`, at most 0.5 below 12."""
 
-    names = FEATURE_NAMES
+    # log(1 + support of the best competing pose), log of the inlier ratio of the matches, log of the ratio of this
+    # pose's unique support to that of its strongest rival (`log_ratio`), log of one standard deviation of the
+    # orientation (degrees)
+    names = ("log_elsewhere", "log_share", "log_own", "log_deviation_deg")
     about = "confidence"
     file = Path(__file__).with_name("confidence.json")
 
@@ -141,7 +139,8 @@ class ConfidenceModel(LogisticRegression):
         """Probability that a pose is within an accuracy, given attributes of its `JointLocalization`."""
         if n_inliers < MIN_INLIERS:
             return 0.0
-        features = confidence_features(n_inliers, n_matches, rival_support, *unique_support, deviation[1])
+        unique, rival_unique = unique_support
+        features = confidence_features(n_inliers, n_matches, rival_support, unique, rival_unique, deviation[1])
         limits = zip(self.errors, accuracy, deviation, strict=True)
         place = float(self.predict_proba(features))
         probability = place * min(model.p_below(limit, own) for model, limit, own in limits)

@@ -114,7 +114,7 @@ class LightGlueMatcher:
         if kind is not self.kind:
             problem = f"the database holds {kind.name}, the landmarks are of {self.kind.name}"
             raise MapError(problem, path=self.features, fix="Map again.")
-        point = np.repeat(arrays.point_ids, np.diff(arrays.observation_start))
+        point = arrays.point_ids[arrays.observation_point]
         row = np.minimum(np.searchsorted(self.landmarks.ids, point), len(self.landmarks) - 1)
         known = self.landmarks.ids[row] == point
         row = row[known]

@@ -176,7 +176,7 @@ class Localizer:
         size. Returns False if they observe too few landmarks to decide. Raises MapError if the weights of the extractor
         are not those of the map.
         """
-        landmark = np.repeat(np.searchsorted(self.landmarks.ids, images.point_ids), np.diff(images.observation_start))
+        landmark = np.searchsorted(self.landmarks.ids, images.point_ids)[images.observation_point]
         n_seen = n_found = 0
         for row, rgb, camera in photographs:
             keypoints = self.extractor.extract(rgb)

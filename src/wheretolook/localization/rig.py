@@ -21,7 +21,15 @@ from wheretolook.geometry.pose_files import (
     poses_of_rows,
     read_named_rows,
 )
-from wheretolook.geometry.poses import Float, as_numbers, camera_centers, compose_poses, invert_poses, rigid_poses
+from wheretolook.geometry.poses import (
+    Float,
+    are_rotations,
+    as_numbers,
+    camera_centers,
+    compose_poses,
+    invert_poses,
+    rigid_poses,
+)
 from wheretolook.geometry.similarity import Similarity
 from wheretolook.utils.errors import ConfigError, PoseError, TableError
 from wheretolook.utils.files import path_ends
@@ -138,8 +146,7 @@ class Look:
         return self if self.focal is None else replace(self, camera=scale_focal(self.camera, ratio))
 
     def __post_init__(self) -> None:
-        rotation = self.cam_from_rig[:, :3]
-        if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6) or np.linalg.det(rotation) < 0:
+        if not are_rotations(self.cam_from_rig[:, :3]):
             raise PoseError("the pose of a view in the rig is not rigid", value=self.cam_from_rig.tolist())
         if np.shape(self.pixels) != (len(self.rows), 2):
             value = (np.shape(self.pixels), len(self.rows))

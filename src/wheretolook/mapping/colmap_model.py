@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
 from wheretolook.geometry.camera import MAX_SIDE_PX, Camera, mean_focal_px, only_camera
-from wheretolook.geometry.poses import Float, camera_centers
+from wheretolook.geometry.poses import Float, are_rotations, camera_centers
 from wheretolook.geometry.similarity import local_origin
 from wheretolook.utils.errors import MapError, MapWarning, StorageError
 from wheretolook.utils.files import STORAGE_FIX, load_npz, save_npz, storage_errors, temporary_folder
@@ -36,7 +36,6 @@ if TYPE_CHECKING:
 REBUILD = "Copy or build the model again."
 # A point without its track. The track's elements follow: image id and index of the keypoint, uint32 each.
 POINT = np.dtype([("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("n", "<u8")])
-_UINT32 = Struct("<I")
 _UINT64 = Struct("<Q")
 _MAX_COORDINATE = 1e12  # of a point or a camera; its square is still finite in single precision
 
@@ -89,26 +88,20 @@ def without_marks(folder: Path, suffix: str) -> Iterator[Path]:
     """Yield a model's folder, or a copy of its texts without the byte-order marks that pycolmap cannot read."""
     names = ("cameras", "images", "points3D", "rigs", "frames") if suffix == ".txt" else ()
     texts = [path for name in names if (path := folder / (name + suffix)).is_file()]
+    has_mark = False
     for path in texts:
-        if path.stat().st_size == 0:  # cannot be mapped
-            continue
-        with path.open("rb") as file, mmap(file.fileno(), 0, access=ACCESS_READ) as content:
-            if content.find(b"\0") >= 0:  # the hole of a sparse file is one line of any length
+        with path.open("rb") as file:
+            has_mark |= file.read(len(BOM_UTF8)) == BOM_UTF8
+            if path.stat().st_size and mmap(file.fileno(), 0, access=ACCESS_READ).find(b"\0") >= 0:
+                # the hole of a sparse file is one line of any length
                 raise MapError("the file is no text: it has a byte 0", path=path, fix=REBUILD)
-    if not any(map(_has_mark, texts)):
+    if not has_mark:
         yield folder
         return
     with temporary_folder() as copy:
         for path in texts:
             (copy / path.name).write_bytes(path.read_bytes().removeprefix(BOM_UTF8))
         yield copy
-
-
-def check_text_complete(path: Path, n_read: int) -> None:
-    """Raise MapError if fewer entries were read than the number that COLMAP writes at the top of a text file."""
-    announced = _announced(path)
-    if n_read < announced:
-        raise MapError(f"the file is truncated: it announces {announced}", path=path, value=n_read, fix=REBUILD)
 
 
 def _announced(path: Path) -> int:
@@ -151,19 +144,12 @@ def _records(data: NDArray[np.uint8], starts: NDArray[np.int64], dtype: np.dtype
     return sliding_window_view(data, dtype.itemsize)[starts].view(dtype.base).reshape(-1, *dtype.shape)
 
 
-def _has_mark(path: Path) -> bool:
-    with path.open("rb") as file:
-        return file.read(len(BOM_UTF8)) == BOM_UTF8
-
-
 def _is_pose(rigid: Any) -> bool:
     """Whether a `pycolmap.Rigid3d` is a rotation and a translation of usual size."""
     matrix = rigid.matrix()
-    if not np.linalg.norm(rigid.rotation.quat) > 0.5:  # of a quaternion of length 0 the matrix is the identity
-        return False
-    with np.errstate(over="ignore", invalid="ignore"):
-        is_rotation = np.abs(matrix[:, :3] @ matrix[:, :3].T - np.eye(3)).max() <= 0.01  # some tools write few decimals
-    return bool(is_rotation and np.abs(matrix[:, 3]).max() <= _MAX_COORDINATE)
+    known = np.linalg.norm(rigid.rotation.quat) > 0.5  # of a quaternion of length 0 the matrix is the identity
+    near = np.abs(matrix[:, 3]).max() <= _MAX_COORDINATE
+    return bool(known and near and are_rotations(matrix[:, :3], 0.01))  # some tools write few decimals
 
 
 def _record_starts(
@@ -214,7 +200,7 @@ def _point_length(data: memoryview, start: int) -> int:
 
 
 def _frame_length(data: memoryview, start: int) -> int:
-    return 68 + 16 * int(_UINT32.unpack_from(data, start + 64)[0])
+    return 68 + 16 * int(Struct("<I").unpack_from(data, start + 64)[0])
 
 
 LANDMARKS_FILE = "landmarks.npz"  # in the folder of a map of this project
@@ -238,6 +224,20 @@ class ModelArrays:
     observation_start: NDArray[np.int64]  # (P + 1,); observations start[i] to start[i + 1] belong to point i
     observation_image: NDArray[np.int64]  # (O,) row in `image_ids`
     observation_keypoint: NDArray[np.int64]  # (O,) index of the keypoint in its image
+
+    @property
+    def track_lengths(self) -> NDArray[np.int64]:
+        """Number of observations of each point, (P,)."""
+        return np.diff(self.observation_start)
+
+    @property
+    def observation_point(self) -> NDArray[np.int64]:
+        """Row of the point of each observation, (O,)."""
+        return np.repeat(np.arange(len(self.points)), self.track_lengths)
+
+    def of_points(self, ids: NDArray[np.int64]) -> ModelArrays:
+        """Return the points of some ids, with their observations."""
+        return select_points(self, np.isin(self.point_ids, ids))
 
 
 def model_suffix(model_dir: str | Path) -> str:
@@ -289,8 +289,11 @@ def _read_files(folder: Path, suffix: str) -> Any:
     if suffix == ".txt":
         numbers = (model.num_cameras(), model.num_images(), model.num_points3D())
         for name, number in zip(MODEL_FILES, numbers, strict=True):
-            check_text_complete(folder / f"{name}.txt", number)
-        check_coordinates(_points_and_tracks(model)[0], folder / "points3D.txt")
+            path = folder / f"{name}.txt"
+            if number < (announced := _announced(path)):
+                raise MapError(f"the file is truncated: it announces {announced}", path=path, value=number, fix=REBUILD)
+        heads = [(number, point.xyz) for number, point in model.points3D.items()]
+        check_coordinates(np.array(heads, dtype=[("id", "u8"), ("xyz", "f8", 3)]), folder / "points3D.txt")
     return model
 
 
@@ -329,8 +332,10 @@ def _consistent(model: Any, folder: Path, suffix: str) -> Any:
 def _contradiction(model: Any, size: float = 1.0) -> str:
     """Describe how many images of a model see points off their observations, in pixels of images `size` times as large.
 
-    Returns "" if that is at most a tenth of them, given the stated errors of the points.
+    Returns "" if that is at most a tenth of them, given the stated errors of the points, and frames have known images.
     """
+    if missing := {data.id for frame in model.frames.values() for data in frame.image_ids} - {*model.images}:
+        return f"{len(missing)} images of the frames are missing"
     side_px = max((max(camera.width, camera.height) for camera in model.cameras.values()), default=1) * size
     # COLMAP drops observations with larger errors than 4 px; programs that state no errors may keep them
     stated_px = model.compute_mean_reprojection_error() or side_px / 400
@@ -430,7 +435,7 @@ def model_arrays(reconstruction: Any) -> ModelArrays:
 
 def select_points(model: ModelArrays, keep: NDArray[np.bool_]) -> ModelArrays:
     """Select the points (P,) of a model for which `keep` is true, with their observations."""
-    lengths = np.diff(model.observation_start)
+    lengths = model.track_lengths
     rows = np.repeat(keep, lengths)
     return replace(
         model,
@@ -448,7 +453,7 @@ def observation_matrix(model: ModelArrays, group: NDArray[np.integer[Any]] | Non
 
     Its product with its own transpose counts the points that two images share.
     """
-    point = np.repeat(np.arange(len(model.points)), np.diff(model.observation_start))
+    point = model.observation_point
     rows = model.observation_image if group is None else group[model.observation_image]
     n_rows = len(model.image_ids) if group is None else int(group.max()) + 1
     from scipy.sparse import coo_array

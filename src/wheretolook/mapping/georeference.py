@@ -13,17 +13,20 @@ from numpy.typing import ArrayLike, NDArray
 from tqdm.auto import tqdm
 
 from wheretolook.geometry.pose_files import NAME_COLUMNS, NamedRows, locations_of_rows, read_named_rows
-from wheretolook.geometry.poses import Float, camera_centers
+from wheretolook.geometry.poses import Float, angle_deg, camera_centers, unit
 from wheretolook.geometry.similarity import Similarity
 from wheretolook.mapping.colmap_model import ModelArrays
-from wheretolook.mapping.config import MARKER, SCALE_TOLERANCE_PERCENT, FrameOptions, MarkerConfig
+from wheretolook.mapping.config import (
+    MARKER,
+    MIN_TRIANGULATION_ANGLE_DEG,
+    SCALE_TOLERANCE_PERCENT,
+    FrameOptions,
+    MarkerConfig,
+)
 from wheretolook.mapping.photographs import read_photograph
 from wheretolook.utils.errors import ConfigError, MapError, TableError
 from wheretolook.utils.files import read_json_object
 from wheretolook.utils.texts import LOG
-
-# A marker is rejected if the root mean square reprojection error of its corners exceeds both this many pixels and this
-# share of the photographs' longer side. That of a marker that was moved, or printed twice, is tens of pixels.
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,11 +94,12 @@ def place_marker(marker_id: int, views: Sequence[MarkerView]) -> Marker:
     images = tuple(view.image for view in views)
     start = np.stack([_meeting_point(views, corner) for corner in range(4)])
     centers = camera_centers(np.stack([view.cam_from_world for view in views]))
-    rays = start.mean(0) - centers
-    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    angle_deg = np.degrees(np.arccos(np.clip((rays @ rays.T).min(), -1, 1)))
-    if not angle_deg >= 1.5:  # as for landmarks
-        problem = f"marker {marker_id} is in photographs from one direction only, {angle_deg:.1f} degrees apart at most"
+    rays = unit(start.mean(0) - centers)
+    widest_deg = angle_deg((rays @ rays.T).min())
+    if not widest_deg >= MIN_TRIANGULATION_ANGLE_DEG:
+        problem = (
+            f"marker {marker_id} is in photographs from one direction only, {widest_deg:.1f} degrees apart at most"
+        )
         raise MapError(problem, value=" ".join(images), fix="Take another photograph of it from another place.")
 
     def residuals(values: Float) -> Float:
@@ -103,6 +107,7 @@ def place_marker(marker_id: int, views: Sequence[MarkerView]) -> Marker:
 
     found = least_squares(residuals, start.ravel(), loss="soft_l1", f_scale=1.0, x_scale="jac")
     error_px = float(np.sqrt(2 * np.mean(residuals(found.x) ** 2)))
+    # that of a marker that was moved, or printed twice, is tens of pixels
     limit_px = max(4.0, 1 / 400 * max(max(view.camera.width, view.camera.height) for view in views))
     if not error_px <= limit_px:
         problem = (
@@ -209,7 +214,6 @@ def _edge_line(grey: NDArray[np.uint8], start: Float, end: Float, inside: Float)
 REPORT_FILE = "report.json"
 DEPTH_M = 5.0
 """Median depth of the images that a map of unknown scale is scaled to: scorers were trained in rooms."""
-MAX_WRONG_SHARE = 0.05  # of given positions that are left out
 
 
 @dataclass(frozen=True)
@@ -376,7 +380,7 @@ def scale_from_depths(arrays: ModelArrays, cam_from_world: Float) -> MapScale:
 
 def median_depths(arrays: ModelArrays, cam_from_world: Float) -> Float:
     """Median depth (I,) of the landmarks that each image observes, from poses (I, 3, 4); NaN where it observes none."""
-    point = np.repeat(arrays.points, np.diff(arrays.observation_start), axis=0)
+    point = arrays.points[arrays.observation_point]
     axis = cam_from_world[arrays.observation_image, 2]
     depth = (axis[:, :3] * point).sum(1) + axis[:, 3]
     ordered = depth[np.lexsort((depth, arrays.observation_image))]
@@ -392,7 +396,7 @@ def scale_from_positions(centers: Mapping[str, Float], positions: Mapping[str, F
     """The scale, and the similarity from camera centres in the map to known positions in metres, by photograph.
 
     The tolerance is a share of the diagonal of the box around the positions used. The worst positions beyond it are left
-    out, up to `MAX_WRONG_SHARE`, with a warning. Raises MapError if fewer than three photographs are in the map, all are
+    out, up to 5 %, with a warning. Raises MapError if fewer than three photographs are in the map, all are
     on a line, or the error of another exceeds the tolerance.
     """
     names = [name for name in positions if name in centers]
@@ -400,7 +404,7 @@ def scale_from_positions(centers: Mapping[str, Float], positions: Mapping[str, F
     if not names and positions and centers:
         value = f"{next(iter(positions))}; images are named like {next(iter(centers))}"
         raise MapError("no position is that of an image in the map", value=value, fix="Name the images as in the map.")
-    for removable in range(int(MAX_WRONG_SHARE * len(names)), -1, -1):
+    for removable in range(int(0.05 * len(names)), -1, -1):
         source = np.array([centers[name] for name in names]).reshape(-1, 3)
         target = np.array([positions[name] for name in names]).reshape(-1, 3)
         similarity = fit_similarity(source, target)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from wheretolook.geometry.poses import camera_centers
 from wheretolook.mapping.colmap_model import (
@@ -198,8 +199,7 @@ def _keypoints_found(image: Any, path: Path, turned: bool) -> int:
 
     Most detectors find the same corners as SIFT, which is asked for 1,000.
     """
-    import cv2
-    from scipy.spatial import cKDTree
+    import cv2  # of an extra
 
     keypoints = np.array([point.xy for point in image.points2D if point.has_point3D()]).reshape(-1, 2)
     rgb = read_photograph(path, turned)

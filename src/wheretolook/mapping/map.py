@@ -238,9 +238,7 @@ class Map:
         model = read_model(path)
         given = None if database is None else Path(database)
         chosen = choose_features(path, model, given, 30_000)  # a search of seconds
-        arrays = model_arrays(model)
-        found = find_frame(path, model, frame, depth_scale, arrays)
-        arrays = found.of_arrays(arrays)
+        arrays, found = _in_world(path, model, frame, depth_scale)
         try:
             landmarks = load_colmap_landmarks(path, chosen, max_reprojection_error_px, device, model, arrays=arrays)
         except MapError as error:
@@ -262,9 +260,7 @@ class Map:
         there are none.
         """
         model = read_model(path)
-        arrays = model_arrays(model)
-        found = find_frame(path, model, frame, arrays=arrays)
-        arrays = found.of_arrays(arrays)
+        arrays, found = _in_world(path, model, frame)
         stored = path / LANDMARKS_FILE
         kept = Landmarks.load(stored) if database is None and stored.is_file() else None
         is_described = kept is not None and kept.descriptors is not None
@@ -291,7 +287,7 @@ class Map:
             has_photographs=has_photographs(path),
             path=path,
             cameras=cameras_by_id(model.cameras, path),
-            images=select_points(arrays, np.isin(arrays.point_ids, landmarks.ids)),
+            images=arrays.of_points(landmarks.ids),
         )
 
     def camera(self, camera: Camera | int | None = None) -> Camera:
@@ -306,8 +302,7 @@ class Map:
         if self.images is not None or not self.has_photographs or self.path is None or not holds_model(self.path):
             return self
         model = read_model(self.path)
-        arrays = model_arrays(model)
-        images = select_points(arrays, np.isin(arrays.point_ids, self.landmarks.ids))
+        images = model_arrays(model).of_points(self.landmarks.ids)
         return replace(self, cameras=cameras_by_id(model.cameras, self.path), images=images)
 
     def without(self, images: ModelArrays, held_out: NDArray[np.int64]) -> Landmarks:
@@ -317,8 +312,7 @@ class Map:
         those of the map, or some of their points.
         """
         observations = ~np.isin(images.observation_image, held_out)
-        point = np.repeat(np.arange(len(images.points)), np.diff(images.observation_start))
-        counts = np.bincount(point[observations], minlength=len(images.points))
+        counts = np.bincount(images.observation_point[observations], minlength=len(images.points))
         left = replace(
             images,
             observation_start=np.concatenate([[0], np.cumsum(counts)]),
@@ -326,3 +320,12 @@ class Map:
             observation_keypoint=images.observation_keypoint[observations],
         )
         return landmarks_of(self.landmarks, select_points(left, counts >= 2))
+
+
+def _in_world(
+    path: Path, model: Any, frame: FrameOptions, depth_scale: float | None = None
+) -> tuple[ModelArrays, MapFrame]:
+    """Return a model as arrays in the world, and its own frame."""
+    arrays = model_arrays(model)
+    found = find_frame(path, model, frame, depth_scale, arrays)
+    return found.of_arrays(arrays), found

@@ -22,8 +22,6 @@ from wheretolook.utils.errors import MapError
 from wheretolook.utils.files import atomic_folder, copy_file, write_text
 from wheretolook.utils.processes import WorkerPool
 
-IMAGES_FOLDER = "images"
-
 
 class Clock:
     """Measures the steps of a map: `with clock("step"):` adds its wall-clock time to `seconds`."""

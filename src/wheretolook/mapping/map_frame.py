@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from wheretolook.geometry.poses import Float, camera_centers
+from wheretolook.geometry.poses import Float, angle_deg, camera_centers
 from wheretolook.geometry.similarity import Similarity
 from wheretolook.mapping.colmap_model import ModelArrays, colmap_poses, model_arrays
 from wheretolook.mapping.config import FrameOptions
@@ -66,7 +66,7 @@ def estimate_gravity(cam_from_world: ArrayLike, up_in_camera: tuple[float, float
         if level is not None:
             up = level if level @ mean > 0 else -level
             return Gravity(up, "level", np.degrees(np.arcsin(np.clip(np.abs(rotation[:, 0] @ up), 0, 1))))
-    residual_deg = np.degrees(np.arccos(np.clip(ups @ mean, -1, 1)))
+    residual_deg = angle_deg(ups @ mean)
     return Gravity(mean, "mean" if up_in_camera is None else "given", residual_deg)
 
 
@@ -101,8 +101,6 @@ def _median_direction(directions: Float) -> Float:
     return at / max(float(np.linalg.norm(at)), 1e-12)
 
 
-MESH_DISTANCE_M = (0.3, 100.0)
-"""Largest plausible median distance of landmarks to a mesh, and the farthest distance that is measured."""
 LOOKING_DOWN = 0.7  # mean of the cameras' axes along -z above which their roll does not determine up
 
 
@@ -132,10 +130,11 @@ def mesh_warning(points: ArrayLike, raycaster: MeshRaycaster) -> str:
     """Message if a mesh seems not to be in a map's frame and unit, because landmarks (N, 3) m are far from it; else ""."""
     at = np.asarray(points, dtype=np.float64)
     at = at[:: max(1, -(-len(at) // 10_000))]  # points are enough for a median
-    off_m = float(np.median(raycaster.distance_to_surface(at, MESH_DISTANCE_M[1])))
-    if not off_m > MESH_DISTANCE_M[0]:
+    farthest_m = 100.0
+    off_m = float(np.median(raycaster.distance_to_surface(at, farthest_m)))
+    if not off_m > 0.3:
         return ""
-    far = f"{off_m:.2f} m or more" if np.isfinite(off_m) else f"more than {MESH_DISTANCE_M[1]:g} m"
+    far = f"{off_m:.2f} m or more" if np.isfinite(off_m) else f"more than {farthest_m:g} m"
     return (
         f"half of the landmarks are {far} from the mesh, so it seems to be in another frame or unit than the model. "
         "Export both in the same frame and unit; --mesh-up y turns a mesh with y up (glTF's own)"
@@ -169,7 +168,7 @@ def up_axis_warning(cam_from_world: ArrayLike, world_from_map: Similarity = Simi
     """
     poses = np.asarray(cam_from_world, dtype=np.float64)
     gravity = estimate_gravity(poses)
-    off_deg = float(np.degrees(np.arccos(np.clip(gravity.up[2], -1, 1))))
+    off_deg = float(angle_deg(gravity.up[2]))
     # people roll a camera by a few degrees, but may tilt all their photographs of an object
     if off_deg <= {"level": 25.0, "mean": 50.0}[gravity.method] or poses[:, 2, 2].mean() < -LOOKING_DOWN:
         return ""
@@ -303,7 +302,7 @@ def find_frame(
 
 def _tilt_deg(rotation: Float, level: Gravity) -> float:
     """Angle between the z axis of a rotated map and up as its cameras were held."""
-    return float(np.degrees(np.arccos(np.clip(rotation[2] @ level.up, -1, 1))))
+    return float(angle_deg(rotation[2] @ level.up))
 
 
 def reported_scale(model_dir: Path) -> MapScale | None:
@@ -364,7 +363,7 @@ def _upright(
         levels = options.up == "level" or not (is_known or not up_axis_warning(poses))
         return ("levelled", level.rotation) if levels else ("model", np.eye(3))
     rotation = rotation_to_z(up)
-    off_deg = np.degrees(np.arccos(np.clip(-poses[:, 1, :3] @ rotation[2], -1, 1)))
+    off_deg = angle_deg(-poses[:, 1, :3] @ rotation[2])
     looking_down = (poses[:, 2, :3] @ rotation[2]).mean() < -LOOKING_DOWN
     if rotation[2, 2] != 1 and np.median(off_deg) > 60 and not looking_down:  # no camera was held like that
         problem = (

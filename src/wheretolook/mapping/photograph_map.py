@@ -11,6 +11,8 @@ from typing import Any
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from tqdm.auto import tqdm
 
 from wheretolook.features.extractor import DescriptorKind, Stored, kind_of
@@ -28,13 +30,17 @@ from wheretolook.mapping.photographs import (
     read_photograph,
     reduce_photograph,
 )
-from wheretolook.mapping.retrieval import photograph_pairs
-from wheretolook.mapping.triangulation import extract_with_colors, fill_database, match_pairs, write_matches
+from wheretolook.mapping.triangulation import (
+    extract_with_colors,
+    fill_database,
+    match_pairs,
+    photograph_pairs,
+    write_matches,
+)
 from wheretolook.utils.errors import ConfigError, MapError
 from wheretolook.utils.files import ArtifactCache, cache_key, storing_in_database, temporary_folder
 from wheretolook.utils.texts import quiet_colmap
 
-_MANIFEST = "steps.json"
 _MIN_IMAGES = 3  # of a model: two photographs do not determine a camera
 _MIN_INLIERS = 30  # as COLMAP needs to place a photograph
 
@@ -108,7 +114,7 @@ def match_and_map(
     version = 2  # of the results
     key = cache_key(version, key, intrinsics, cameras.camera_of.tolist(), cameras.given, seed)
     folder = work / "sparse"
-    cache = ArtifactCache(work, key, "sparse", _MANIFEST)
+    cache = ArtifactCache(work, key, "sparse", "steps.json")
     results = cache.load("sparse.json") if cache.is_current(database, folder) else None
     if results is None:
         cache.clear()
@@ -125,7 +131,7 @@ def _cached_arrays(
     work: Path, key: str, step: str, compute: Callable[[], dict[str, NDArray[Any]]]
 ) -> dict[str, NDArray[Any]]:
     """Arrays of a step of work, read from its file or computed and written there."""
-    cache = ArtifactCache(work, key, step, _MANIFEST)
+    cache = ArtifactCache(work, key, step, "steps.json")
     name = f"{step}.npz"
     return (cache.load(name) or cache.store({name: compute()}))[name]
 
@@ -206,9 +212,6 @@ def _reconstruct(database: Path, folder: Path, cameras: PhotographCameras, seed:
 
 def _connected(database: Path, n: int) -> int:
     """Return how many of n photographs are connected by pairs with enough verified matches to place one by another."""
-    from scipy.sparse import coo_array  # takes longer than all of --help
-    from scipy.sparse.csgraph import connected_components
-
     with pycolmap.Database.open(str(database)) as db:
         pair_ids, n_inliers = db.read_two_view_geometry_num_inliers()
     verified = [pair for pair, number in zip(pair_ids, n_inliers, strict=True) if number >= _MIN_INLIERS]

@@ -18,7 +18,7 @@ from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.mesh import TexturedMesh
 from wheretolook.geometry.poses import Float, poses_looking_along
 from wheretolook.mapping.config import PARTNERS, WALK, MapConfig
-from wheretolook.mapping.map_folder import DATABASE_FILE, IMAGES_FOLDER, MapDraft, MapReport, finish_map, replacing_map
+from wheretolook.mapping.map_folder import DATABASE_FILE, MapDraft, MapReport, finish_map, replacing_map
 from wheretolook.mapping.triangulation import (
     choose_pairs,
     extract_with_colors,
@@ -267,7 +267,7 @@ def build_map(  # a scene has four parts, and the output and its resources are t
         with clock("render_and_extract"):
             depth: list[NDArray[np.float32]] = []
             drawn = Appearance.of_views(poses, config.appearance, seed) if config.appearance else []
-            keep_in = folder / IMAGES_FOLDER if config.keep_images else None
+            keep_in = folder / "images" if config.keep_images else None
             images = _rendered(renderer, camera, poses, drawn, depth, keep_in)
             extracted = extract_with_colors(images, len(poses), "map: render, extract", run)
             stored, colors = zip(*extracted, strict=True)

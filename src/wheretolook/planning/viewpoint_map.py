@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
@@ -24,7 +26,6 @@ from wheretolook.geometry.poses import (
 from wheretolook.geometry.similarity import Similarity
 from wheretolook.geometry.views import Views
 from wheretolook.looks.selection import best_views
-from wheretolook.robot.wheretolook_robot import description_digest
 from wheretolook.utils.errors import ConfigError, MapFormatError
 from wheretolook.utils.files import atomic_folder, read_json, save_npy, sha256, write_json, write_text
 from wheretolook.utils.processes import hold
@@ -149,7 +150,12 @@ def write_map(
             "origin": dict(origin),
             "sha256": checksums,
         }
-        write_json(new / DESCRIPTION, {**content, "digest": description_digest(content)})
+        write_json(new / DESCRIPTION, {**content, "digest": _digest(content)})
+
+
+def _digest(description: Mapping[str, Any]) -> str:
+    """Return the SHA-256 of a description, apart from this digest."""
+    return hashlib.sha256(json.dumps(description, sort_keys=True).encode()).hexdigest()
 
 
 def _check_replaceable(folder: Path) -> None:
@@ -183,7 +189,7 @@ def read_map(
         content = read_json(path)
         if (content["format"], content["version"]) != (FORMAT, VERSION):
             raise ValueError(f"not a viewpoint map of version {VERSION}")
-        if content.pop("digest") != description_digest(content):
+        if content.pop("digest") != _digest(content):
             raise ValueError("changed since it was written")
         bounds = np.array([content["grid"]["lower"], content["grid"]["upper"]], dtype=np.float64)
         nx, ny, nz = (int(side) for side in content["grid"]["shape"])

@@ -18,8 +18,9 @@ PERSON_M = (1.7, 0.5)
 READ_NOISE = 1 / 30
 """Standard deviation of noise in black, over that of shot noise in white."""
 
-_STEPS = np.linspace(0, 1, 256)
-_LIGHT = np.where(_STEPS <= 0.04045, _STEPS / 12.92, ((_STEPS + 0.055) / 1.055) ** 2.4).astype(np.float32)
+_LIGHT = np.array(
+    [s / 12.92 if s <= 0.04045 else ((s + 0.055) / 1.055) ** 2.4 for s in np.linspace(0, 1, 256)], np.float32
+)
 """Linear light of the sRGB values 0 to 255 (IEC 61966-2-1)."""
 
 _SRGB = np.searchsorted((_LIGHT[1:] + _LIGHT[:-1]) / 2, np.linspace(0, 1, 2**14)).astype(np.uint8)

@@ -10,6 +10,7 @@ import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
 from wheretolook.geometry.mesh import TexturedMesh
+from wheretolook.geometry.poses import as_points
 from wheretolook.utils.devices import in_threads
 from wheretolook.utils.processes import cores
 from wheretolook.utils.warp import start_warp, vec3_array
@@ -120,7 +121,7 @@ class MeshRaycaster:
         Geometry closer to the point than `margin_m` does not count, so that a landmark on (or, by its triangulation
         error, a little behind) a surface is not hidden by that surface. Shorter segments are never occluded.
         """
-        origins_at = np.asarray(origins, dtype=np.float64).reshape(-1, 3)
+        origins_at = as_points(origins)
         points_on_device = self.upload(points)
         n_points = points_on_device.shape[0]
         occluded = np.zeros((len(origins_at), n_points), dtype=np.bool_)

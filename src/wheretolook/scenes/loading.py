@@ -69,12 +69,12 @@ def load_mesh(path: str | PathLike[str], up: str = "z", colored: bool = True) ->
     file = _mesh_file(Path(path))
     _check_file(file)
     try:
-        source: Any = {".glb": _with_all_applied, ".obj": _with_positive_indices}.get(file.suffix.lower(), str)(file)
-        named: dict[str, Any] = {
-            "file_type": file.suffix[1:].lower(),
-            "resolver": trimesh.resolvers.FilePathResolver(str(file)),
-        }
-        scene = trimesh.load_scene(source, process=False, **({} if source == str(file) else named))
+        corrected = {".glb": _with_all_applied, ".obj": _with_positive_indices}.get(file.suffix.lower())
+        changed = corrected(file) if corrected else None
+        source, kind = changed or (file.open("rb"), file.suffix[1:].lower())
+        with source:
+            resolver = trimesh.resolvers.FilePathResolver(str(file))
+            scene = trimesh.load_scene(source, file_type=kind, resolver=resolver, process=False)
         parts = list(_parts(scene))
     except Exception as error:  # trimesh's parsers raise errors of many kinds
         raise SceneError("the mesh cannot be read", path=file, value=str(error), fix="Check the file") from error
@@ -161,7 +161,7 @@ def _glb_textures(path: Path) -> Iterator[Path | bytes]:
     shown = [meshes[node["mesh"]] for node in tree.get("nodes", []) if "mesh" in node]
     if sum(map(len, meshes + shown)) > 40_000:  # trimesh takes 0.3 ms for each
         raise ValueError("its meshes and nodes have more than 40,000 parts; join them")
-    drawn = [part.get("indices", part["attributes"]["POSITION"]) for part in itertools.chain(*shown)]
+    drawn = [part.get("indices", part["attributes"]["POSITION"]) for part in itertools.chain.from_iterable(shown)]
     n_corners = sum(accessors[at]["count"] for at in drawn)
     if n_corners > fitting(200):  # bytes of a corner while it is read
         raise ValueError(f"its nodes have {n_corners // 3:,} triangles together")
@@ -182,6 +182,10 @@ def _read_glb(path: Path) -> tuple[dict[str, Any], bytes]:
     return parse_json_object(content[20 : 20 + json_length].decode()), content[28 + json_length :]
 
 
+def _primitives(tree: dict[str, Any]) -> list[dict[str, Any]]:
+    return [primitive for mesh in tree.get("meshes", []) for primitive in mesh["primitives"]]
+
+
 def _buffers(tree: dict[str, Any], content: bytes, path: Path) -> list[bytes]:
     sources = [_at_uri(one["uri"], path) if "uri" in one else content for one in tree.get("buffers", [])]
     return [source.read_bytes() if isinstance(source, Path) else source for source in sources]
@@ -189,7 +193,7 @@ def _buffers(tree: dict[str, Any], content: bytes, path: Path) -> list[bytes]:
 
 def _check_readable(tree: dict[str, Any], path: Path) -> None:
     """Raise SceneError if geometry of a glTF file is stored in a way that is not read."""
-    primitives = [primitive for mesh in tree.get("meshes", []) for primitive in mesh["primitives"]]
+    primitives = _primitives(tree)
     positions = [tree["accessors"][primitive["attributes"]["POSITION"]] for primitive in primitives]
     # materials and textures may change how a mesh appears, but not where it is
     unread = {
@@ -208,15 +212,15 @@ def _check_readable(tree: dict[str, Any], path: Path) -> None:
         raise SceneError(problem, path=path, value=", ".join(sorted(unread)), fix=fix)
 
 
-def _with_all_applied(path: Path) -> str | io.BytesIO:
-    """The file, or its content with what trimesh ignores applied: normalized integers, and transforms of textures.
+def _with_all_applied(path: Path) -> tuple[io.BytesIO, str] | None:
+    """The file as glTF with what trimesh ignores applied: normalized integers, and transforms of textures; None without.
 
     Normalized integers (glTF 2.0, 3.6.2.2) become float numbers, other than colours, which trimesh expects as integers.
     Texture coordinates are transformed by the extension KHR_texture_transform of their material's colour.
     """
     tree, content = _read_glb(path)
     accessors = tree.get("accessors", [])
-    primitives = [primitive for mesh in tree.get("meshes", []) for primitive in mesh["primitives"]]
+    primitives = _primitives(tree)
     used = {at for primitive in primitives for name, at in primitive["attributes"].items() if name[:5] != "COLOR"}
     changed: list[tuple[dict[str, Any], dict[str, Any]]] = [
         (accessors[at], {}) for at in sorted(used) if accessors[at].get("normalized")
@@ -231,9 +235,8 @@ def _with_all_applied(path: Path) -> str | io.BytesIO:
             accessors.append(accessor)
             changed.append((accessor, transform))
     if not changed:
-        return str(path)
+        return None
     buffers = _buffers(tree, content, path)
-    tree["buffers"].append({})
     decoded = b""
     for accessor, transform in changed:
         view = tree["bufferViews"][accessor["bufferView"]]
@@ -257,25 +260,21 @@ def _with_all_applied(path: Path) -> str | io.BytesIO:
         }
         tree["bufferViews"].append({"buffer": len(buffers), "byteOffset": len(decoded), "byteLength": len(values)})
         decoded += values
-    tree["buffers"][-1] = {
-        "byteLength": len(decoded),
-        "uri": f"data:application/octet-stream;base64,{base64.b64encode(decoded).decode()}",
-    }
-    chunk = json.dumps(tree).encode()
-    chunk += b" " * (-len(chunk) % 4)
-    own = struct.pack("<I4s", len(content), b"BIN\0") + content if content else b""
-    header = struct.pack("<4sIII4s", b"glTF", 2, 20 + len(chunk) + len(own), len(chunk), b"JSON")
-    return io.BytesIO(header + chunk + own)
+    tree["buffers"] = []
+    for buffer in (*buffers, decoded):
+        uri = f"data:application/octet-stream;base64,{base64.b64encode(buffer).decode()}"
+        tree["buffers"].append({"byteLength": len(buffer), "uri": uri})
+    return io.BytesIO(json.dumps(tree).encode()), "gltf"
 
 
-def _with_positive_indices(path: Path) -> str | io.StringIO:
-    """The OBJ file, or its text with indices from the start of the file for those from the line, which trimesh ignores.
+def _with_positive_indices(path: Path) -> tuple[io.StringIO, str] | None:
+    """The text of an OBJ file with indices from the start of the file for those from the line, which trimesh ignores.
 
-    Raises ValueError for an index before the first element.
+    None if it has no such index. Raises ValueError for one before the first element.
     """
     with path.open(encoding="utf-8", errors="replace") as file:
         if not any(line.startswith("f") and "-" in line for line in file):
-            return str(path)
+            return None
     counts = dict.fromkeys(("v", "vt", "vn"), 0)
     lines = []
     for line in path.read_text(encoding="utf-8", errors="replace").replace("\\\n", " ").splitlines():
@@ -286,7 +285,7 @@ def _with_positive_indices(path: Path) -> str | io.StringIO:
             corners = [word.split("/") for word in words[1:]]
             line = " ".join(["f", *("/".join(map(_positive, corner, counts.values())) for corner in corners)])
         lines.append(line)
-    return io.StringIO("\n".join(lines) + "\n")
+    return io.StringIO("\n".join(lines) + "\n"), "obj"
 
 
 def _positive(index: str, count: int) -> str:

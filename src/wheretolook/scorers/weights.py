@@ -8,15 +8,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from wheretolook.dataset.config import RELEASE
+from wheretolook.dataset.layout import Dataset
 from wheretolook.geometry.camera import camera_of_record
 from wheretolook.scorers.base import Scorer, same_field_of_view
 from wheretolook.scorers.registry import SUBSTITUTES, BuildOptions, build_scorer, check_method, members, scorers
+from wheretolook.training.provenance import was_trained_on
 from wheretolook.training.weights import method_of_weights, preference, read_training, read_weights
 from wheretolook.utils.errors import ConfigError, WeightsError
 from wheretolook.utils.package import WEIGHTS, or_shipped, shipped
 
 if TYPE_CHECKING:
-    from wheretolook.dataset.layout import Dataset
     from wheretolook.inputs.localization_map import LocalizationMap
 
 
@@ -116,8 +117,6 @@ def _folders(folder: Path, features: str) -> Iterator[Path]:
 
 def _best_for_dataset(dataset: Dataset, kinds: set[str], log: Callable[[str], None]) -> Path | None:
     """Return the preferred file that serves a dataset's cameras, from the first folder that has any."""
-    from wheretolook.training.provenance import was_trained_on
-
     own = dataset.root / "weights"
     others = (dataset.root.parent / RELEASE / "weights", shipped(WEIGHTS))
     for folder in dict.fromkeys((own, *(next(_folders(other, dataset.features)) for other in others), *others)):

@@ -112,12 +112,12 @@ class QueryImages:
         fitting = [rgb for rgb in readings if any(_has_proportions(one, rgb) for one in candidates)]
         rgb = (fitting or readings)[0]
         quarters = 0 if path is None or self.upright is (rgb is readings[0]) else quarters_upright(path) % 4
-        if known is not None and fitting:
-            return replace(_fitted(name, rgb, known, known_from), quarters=quarters)
-        if known is not None:
+        if known is None:
+            return replace(self._assumed(path, name, rgb), quarters=quarters)
+        if not fitting:
             problem = f"the image of {_size(rgb)} has other proportions than the camera"
             raise ConfigError(problem, path=path, value=describe_camera(known), fix="Correct --camera.")
-        return replace(self._assumed(path, name, rgb), quarters=quarters)
+        return replace(_fitted(name, rgb, known, known_from), quarters=quarters)
 
     def photograph(self, name: str) -> Path | None:
         """Return the file of a mapping image; None if it is not found."""
@@ -131,20 +131,19 @@ class QueryImages:
     def _is_mapping_image(self, path: Path, readings: Sequence[NDArray[np.uint8]], name: str) -> bool:
         """Test whether a file is the mapping image of this name, not another zoom, size or place.
 
-        It is the same file, or has its size and EXIF focal length. Where the photographs are not found, it must have the
-        proportions and at least the size of the camera, and no EXIF focal length that contradicts it.
+        It is the same file. Where the photographs are not found, it must have the proportions and at least the size of the
+        camera, and no EXIF focal length that contradicts it.
         """
-        in_exif = exif_focal_px(path)
         original = self.photograph(name)
         if original is not None:
-            same_focal = in_exif is not None and in_exif == exif_focal_px(original)  # in pixels of its size
-            return same_focal or filecmp.cmp(path, original, shallow=False)
+            return filecmp.cmp(path, original, shallow=False)
+        in_exif = exif_focal_px(path)
         camera = self.by_name[name]
         ratio = max(readings[0].shape) / max(camera.width, camera.height)
-        agrees = (
-            in_exif is None or abs(np.log(in_exif / (camera.colmap.mean_focal_px * ratio))) < 0.05
-        )  # as in `_assumed`
-        return ratio >= 1 and bool(agrees) and any(_has_proportions(camera, rgb) for rgb in readings)
+        if ratio < 1 or not any(_has_proportions(camera, rgb) for rgb in readings):
+            return False
+        expected = camera.colmap.mean_focal_px * ratio
+        return in_exif is None or 0.95 < in_exif / expected < 1.05  # as in `_assumed`
 
     def _known(
         self, path: Path | None, name: str, given: KnownCamera | None, readings: Sequence[NDArray[np.uint8]]
@@ -170,12 +169,9 @@ class QueryImages:
         """Assume the camera of an image: one of the map, whatever the EXIF data say, or a pinhole by these."""
         height, width = rgb.shape[:2]
         in_exif = None if path is None else exif_focal_px(path)
-        cameras = {number: one for number, one in self.cameras.items() if _has_proportions(one, rgb)}
-        turns = [0]
-        if not cameras:
-            sideways = np.swapaxes(rgb, 0, 1)
-            cameras = {number: one for number, one in self.cameras.items() if _has_proportions(one, sideways)}
-            turns = [1, 3]
+        fits = any(_has_proportions(one, rgb) for one in self.cameras.values())
+        turns, shown = ([0], rgb) if fits else ([1, 3], np.swapaxes(rgb, 0, 1))
+        cameras = {number: one for number, one in self.cameras.items() if _has_proportions(one, shown)}
         if not cameras and in_exif is not None:
             focal = FocalPrior((in_exif,), (0.03,))  # whole millimetres; crops and resized photographs
             return _fitted(name, rgb, PinholeCamera(width, height, in_exif), "assumed: EXIF focal length", focal)

@@ -6,19 +6,21 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 from tqdm.auto import tqdm
 
-from wheretolook.geometry.poses import Float, pan_tilt_angles, poses_looking_along
+from wheretolook.geometry.poses import Float, camera_centers, pan_tilt_angles, poses_looking_along
 from wheretolook.geometry.views import Views
 from wheretolook.inputs.landmark_features import ReasonCounter
+from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.looks.selection import best_views, separated
 from wheretolook.planning.config import StopConfig
 from wheretolook.planning.routes import PlannedPath
 from wheretolook.planning.stops import stops_along
 from wheretolook.planning.view_sequence import TurnLimit, best_sequence
 from wheretolook.scorers.base import Scorer
-from wheretolook.select.waypoints import SelectionRequest, Waypoints, usable_waypoints
-from wheretolook.utils.errors import ConfigError
+from wheretolook.select.waypoints import SelectionRequest, Waypoints
+from wheretolook.utils.errors import ConfigError, TableError
 
 
 def select_views(
@@ -53,6 +55,44 @@ def select_views(
         prior = PoseUncertainty(request.sigma_m or 0.0, request.yaw_sigma_deg or 0.0)
         views = prior.with_expected_scores(views, candidates, progress)
     return with_reasons(reasons, replace(views, waypoint=rows[views.waypoint])).in_frame(localization_map.frame)
+
+
+def usable_waypoints(localization_map: LocalizationMap, waypoints: Waypoints, skip: bool = False) -> NDArray[np.bool_]:
+    """Return at which waypoints views can be scored, (W,): at all of them, unless `skip` leaves others out.
+
+    A waypoint is outside the map if it is farther from every landmark, and from every mapping camera, than all but 5 %
+    of the landmarks were from the cameras that mapped them. Raises a TableError that names the first of those outside
+    the map or inside geometry, or if none is left.
+    """
+    landmarks = localization_map.landmarks
+    world_from_map = localization_map.frame.world_from_map
+    points = world_from_map.apply(waypoints.points)
+    reach = float(np.quantile(landmarks.mapping_distance_m, 0.95))
+    to_landmark = cKDTree(landmarks.points).query(points)[0]
+    nearest: Float = to_landmark
+    if localization_map.mapping_poses is not None:
+        centers = camera_centers(localization_map.mapping_poses.astype(np.float64))
+        nearest = np.minimum(nearest, cKDTree(centers).query(points)[0])
+    outside = nearest > reach
+    inside = ~outside & (to_landmark <= 1e-6)  # landmarks are on surfaces
+    rest = np.flatnonzero(~outside & ~inside)
+    inside[rest] = localization_map.occlusion.inside_geometry(points[rest])
+    bad = outside | inside
+    if not bad.any() or (skip and not bad.all()):
+        return np.asarray(~bad)
+    problems = []
+    for row in np.flatnonzero(bad)[:5]:
+        why = (
+            f"{nearest[row] / world_from_map.scale:.3g} from all landmarks and cameras"
+            if outside[row]
+            else "inside geometry"
+        )
+        problems.append(f"{waypoints.where(row)} {why}")
+    low, high = np.quantile(world_from_map.inverse.apply(landmarks.points), (0.01, 0.99), axis=0).round(1).tolist()
+    fix = f"The map's landmarks are within {low} to {high}, in its unit: check unit and axes"
+    fix += "." if bad.all() else ", or leave these out: --skip, in Python skip=True."
+    problem = f"{bad.sum()} of {len(waypoints)} waypoints are outside the map or inside geometry"
+    raise TableError(problem, path=waypoints.path, value="; ".join(problems), fix=fix)
 
 
 def _within_pitch(directions: Float, request: SelectionRequest) -> Float:

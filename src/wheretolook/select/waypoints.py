@@ -20,13 +20,7 @@ from wheretolook.geometry.pose_files import (
     poses_of_rows,
     read_named_rows,
 )
-from wheretolook.geometry.poses import (
-    Float,
-    camera_centers,
-    pan_tilt_angles,
-    quaternion_from_rotation,
-    rotation_from_quaternion,
-)
+from wheretolook.geometry.poses import Float, pan_tilt_angles, quaternion_from_rotation, rotation_from_quaternion
 from wheretolook.looks.selection import MAX_VIEWS
 from wheretolook.utils.errors import ConfigError, SceneError, TableError, check_limits, check_pitch, check_range, reject
 
@@ -165,46 +159,6 @@ def grid_waypoints(localization_map: LocalizationMap, space: Any, spacing_m: flo
     if len(free) == 0:
         raise SceneError("no location of the grid is free", value=spacing_m, fix="Narrow the grid.")
     return Waypoints(centers[free], tuple(map(str, free)))
-
-
-def usable_waypoints(localization_map: LocalizationMap, waypoints: Waypoints, skip: bool = False) -> NDArray[np.bool_]:
-    """Return at which waypoints views can be scored, (W,): at all of them, unless `skip` leaves others out.
-
-    A waypoint is outside the map if it is farther from every landmark, and from every mapping camera, than all but 5 %
-    of the landmarks were from the cameras that mapped them. Raises a TableError that names the first of those outside
-    the map or inside geometry, or if none is left.
-    """
-    from scipy.spatial import cKDTree
-
-    landmarks = localization_map.landmarks
-    world_from_map = localization_map.frame.world_from_map
-    points = world_from_map.apply(waypoints.points)
-    reach = float(np.quantile(landmarks.mapping_distance_m, 0.95))
-    to_landmark = cKDTree(landmarks.points).query(points)[0]
-    nearest: Float = to_landmark
-    if localization_map.mapping_poses is not None:
-        centers = camera_centers(localization_map.mapping_poses.astype(np.float64))
-        nearest = np.minimum(nearest, cKDTree(centers).query(points)[0])
-    outside = nearest > reach
-    inside = ~outside & (to_landmark <= 1e-6)  # landmarks are on surfaces
-    rest = np.flatnonzero(~outside & ~inside)
-    inside[rest] = localization_map.occlusion.inside_geometry(points[rest])
-    bad = outside | inside
-    if not bad.any() or (skip and not bad.all()):
-        return np.asarray(~bad)
-    problems = []
-    for row in np.flatnonzero(bad)[:5]:
-        why = (
-            f"{nearest[row] / world_from_map.scale:.3g} from all landmarks and cameras"
-            if outside[row]
-            else "inside geometry"
-        )
-        problems.append(f"{waypoints.where(row)} {why}")
-    low, high = np.quantile(world_from_map.inverse.apply(landmarks.points), (0.01, 0.99), axis=0).round(1).tolist()
-    fix = f"The map's landmarks are within {low} to {high}, in its unit: check unit and axes"
-    fix += "." if bad.all() else ", or leave these out: --skip, in Python skip=True."
-    problem = f"{bad.sum()} of {len(waypoints)} waypoints are outside the map or inside geometry"
-    raise TableError(problem, path=waypoints.path, value="; ".join(problems), fix=fix)
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from wheretolook.dataset.config import ACCURACY, Accuracy
-from wheretolook.dataset.scene import ColmapFiles, Scene, SceneConfig
+from wheretolook.dataset.scene import ColmapFiles, Scene
 from wheretolook.geometry.camera import Camera, PinholeCamera, parse_camera
 from wheretolook.geometry.lattices import Lattice, direction_lattice
 from wheretolook.geometry.poses import Float, camera_centers, rigid_poses
@@ -26,8 +26,8 @@ from wheretolook.mapping.map_frame import MapFrame
 from wheretolook.scorers.base import Scorer
 from wheretolook.scorers.registry import make_scorer
 from wheretolook.scorers.weights import resolve_weights
-from wheretolook.select.selection import reported, select_views, with_reasons
-from wheretolook.select.waypoints import SelectionRequest, Waypoints, grid_waypoints, usable_waypoints
+from wheretolook.select.selection import reported, select_views, usable_waypoints, with_reasons
+from wheretolook.select.waypoints import SelectionRequest, Waypoints, grid_waypoints
 from wheretolook.space.mapped_space import MappedSpace
 from wheretolook.training.weights import method_of_weights
 from wheretolook.utils.devices import usable_device
@@ -132,7 +132,7 @@ class WhereToLook:
         mesh, depth, database = (None if file is None else Path(file) for file in (mesh, depth, database))
         options = FrameOptions(**frame)
         files = ColmapFiles(Path(path), mesh, depth, depth_scale, database, max_reprojection_error_px, options, mesh_up)
-        scene = Scene.of_colmap(files, camera, occlusion, SceneConfig(occlusion_cache_bytes=1 << 30), device)
+        scene = Scene.of_colmap(files, camera, occlusion, device, cache_bytes=1 << 30)
         of_each &= fov_deg is None and len({*scene.map.cameras.values()}) > 1
         if of_each:
             scene.camera = next(iter(scene.map.cameras.values()))

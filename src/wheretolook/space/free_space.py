@@ -11,7 +11,7 @@ from tqdm.auto import tqdm
 
 from wheretolook.geometry.lattices import VoxelGrid
 from wheretolook.geometry.mesh import TexturedMesh
-from wheretolook.geometry.poses import Float
+from wheretolook.geometry.poses import Float, as_points
 from wheretolook.geometry.tsdf import DepthImages, TsdfVolume
 from wheretolook.rendering.raycasting import MeshRaycaster, RayHits
 from wheretolook.space.config import FreeSpaceConfig
@@ -42,7 +42,7 @@ class FreeSpace:
         straight below is level (within 60 degrees) and at most `max_floor_drop_m` away, and the point is enclosed, as
         `FreeSpaceConfig` says.
         """
-        at = np.asarray(points, dtype=np.float64).reshape(-1, 3)
+        at = as_points(points)
         free = ((at >= self.bounds[0]) & (at <= self.bounds[1])).all(axis=1)  # the cheap tests first
         clearance_m = self.config.clearance_m
         free[free] = self.raycaster.distance_to_surface(at[free], clearance_m) >= clearance_m
@@ -55,14 +55,15 @@ class FreeSpace:
 
         Both ends must be free and every point between must keep the clearance; it need not be above a floor.
         """
-        start, end = (np.asarray(points, dtype=np.float64).reshape(-1, 3) for points in (a, b))
+        start = as_points(a)
+        end = as_points(b)
         free = self.is_free(start) & self.is_free(end)
         free[free] = self.raycaster.segments_are_clear(start[free], end[free], self.config.clearance_m)
         return free
 
     def floor_below(self, points: ArrayLike) -> NDArray[np.float64]:
         """Height z (N,) of the floor below points (N, 3) metres; NaN where `is_free` would find none."""
-        at = np.asarray(points, dtype=np.float64).reshape(-1, 3)
+        at = as_points(points)
         hits = self.raycaster.cast(at, (0.0, 0.0, -1.0))
         near = hits.distance_m <= self.config.max_floor_drop_m
         is_floor = near & self._level[hits.triangle] & (hits.front | self.two_sided)
@@ -133,18 +134,18 @@ class TsdfSpace(FreeSpace):
         progress: bool = True,
     ) -> None:
         super().__init__(volume.surface(), replace(config, two_sided=False), device)
-        self._step_m = volume.config.voxel_size_m
+        self._step_m = volume.voxel_size_m
         cell_m = max(self._step_m, min(0.05, self.config.clearance_m / 2))
         nx, ny, nz = np.maximum(np.ceil((self.bounds[1] - self.bounds[0]) / cell_m), 1).astype(int).tolist()
         self.cells = VoxelGrid.over(self.bounds, (nx, ny, nz))
-        seen = seen_through(self.cells.centers(), images, volume.config.max_depth_m, progress)
+        seen = seen_through(self.cells.centers(), images, volume.max_depth_m, progress)
         padded = np.pad(seen.reshape(nx, ny, nz), 1)  # space beyond the bounds counts as unseen
         to_unseen_m = distance_transform_edt(padded, sampling=self.cells.voxel_m)[1:-1, 1:-1, 1:-1]
         self.to_unseen_m = to_unseen_m.astype(np.float32)
 
     def is_free(self, points: ArrayLike) -> NDArray[np.bool_]:
         """Whether a camera can be at points (N, 3) metres: as in `FreeSpace`, and clear of unseen space; (N,)."""
-        at = np.asarray(points, dtype=np.float64).reshape(-1, 3)
+        at = as_points(points)
         free = self._is_off_unseen(at)
         free[free] = super().is_free(at[free])
         return free
@@ -154,7 +155,8 @@ class TsdfSpace(FreeSpace):
 
         As in `FreeSpace`, and all of the segment must be clear of unseen space (tested at most a voxel apart).
         """
-        start, end = (np.asarray(points, dtype=np.float64).reshape(-1, 3) for points in (a, b))
+        start = as_points(a)
+        end = as_points(b)
         free = super().segments_are_free(start, end)
         rows = np.flatnonzero(free)
         length = np.linalg.norm(end[rows] - start[rows], axis=1)

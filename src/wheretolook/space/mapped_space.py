@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
-from wheretolook.geometry.poses import Float
+from wheretolook.geometry.poses import Float, as_points
 from wheretolook.space.config import MappedSpaceConfig
 from wheretolook.utils.errors import MapError
 
@@ -22,7 +22,8 @@ class MappedSpace:
         self, landmarks: ArrayLike, cameras: ArrayLike, config: MappedSpaceConfig = MappedSpaceConfig()
     ) -> None:
         self.config = config
-        points, centers = (np.asarray(values, dtype=np.float64).reshape(-1, 3) for values in (landmarks, cameras))
+        points = as_points(landmarks)
+        centers = as_points(cameras)
         if not len(points) or not len(centers):
             value = (len(points), len(centers))
             fix = "Run the map stage again."
@@ -39,7 +40,7 @@ class MappedSpace:
 
     def is_free(self, points: ArrayLike) -> NDArray[np.bool_]:
         """Whether a camera can be at points (N, 3) metres; (N,)."""
-        at = np.asarray(points, dtype=np.float64).reshape(-1, 3)
+        at = as_points(points)
         free = ((at >= self.bounds[0]) & (at <= self.bounds[1])).all(axis=1)
         free &= self._cameras.query(at)[0] <= self.config.max_camera_distance_m
         free &= self._landmarks.query(at)[0] >= self.config.clearance_m
@@ -51,8 +52,7 @@ class MappedSpace:
         Both ends must be free, no landmark may be closer to the segment than the clearance, and the segment must stay
         near mapping cameras (tested every 2 cm).
         """
-        start, end = (np.asarray(points, dtype=np.float64).reshape(-1, 3) for points in (a, b))
-        start, end = np.broadcast_arrays(start, end)
+        start, end = np.broadcast_arrays(as_points(a), as_points(b))
         free = self.is_free(start) & self.is_free(end)
         for n in np.flatnonzero(free):
             free[n] = self._is_clear(start[n], end[n]) and self._stays_near_cameras(start[n], end[n])

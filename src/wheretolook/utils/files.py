@@ -333,10 +333,10 @@ def image_size(image: Path | bytes, at_most: int = MAX_PIXELS) -> tuple[int, int
     if isinstance(image, Path):
         check_file(image)
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # the limit is ours
-            with Image.open(image if isinstance(image, Path) else io.BytesIO(image)) as opened:
-                width, height = opened.size
+        source = image if isinstance(image, Path) else io.BytesIO(image)
+        quiet = warnings.catch_warnings(action="ignore", category=Image.DecompressionBombWarning)  # the limit is ours
+        with quiet, Image.open(source) as opened:
+            width, height = opened.size
     except Exception as error:  # decoders raise errors of many kinds
         raise ValueError(f"this is no image: {error}") from error
     if width * height > at_most:

@@ -28,11 +28,9 @@ FALSE_NEGATIVE = (0, 114, 178)
 
 CAMERA_COLOR = (86, 180, 233)
 LANDMARK_COLOR = (150, 150, 155)
-PATH_COLORS = ((120, 120, 120), (0, 114, 178), (0, 158, 115), (204, 121, 167), (230, 159, 0))
 
 CELL_PX = 6  # pixels of a floor's cell, so that its edges stay sharp
 PICTURE_PX = 360  # width of images in the panel
-DOT_PX = 1.6  # radius of landmarks on images
 
 _PUNCTUATION = re.compile(r"([!-/:-@\[-`{-~])")  # ASCII punctuation, which CommonMark escapes by a backslash
 
@@ -49,7 +47,8 @@ def _colormap() -> Any:
 
 def path_color(number: int) -> tuple[int, int, int]:
     """Return the colour of a path by its number."""
-    return PATH_COLORS[number % len(PATH_COLORS)]
+    colors = ((120, 120, 120), (0, 114, 178), (0, 158, 115), (204, 121, 167), (230, 159, 0))
+    return colors[number % len(colors)]
 
 
 def score_colors(values: Float, low: float = 0.0, high: float = 1.0) -> Rgb:
@@ -159,8 +158,9 @@ def picture(rgb: Rgb | None, camera: Camera, visible: VisibleLandmarks) -> Rgb:
     draw = ImageDraw.Draw(ground)
     order = np.argsort(np.nan_to_num(visible.probabilities), kind="stable")  # probable ones on top
     colors = score_colors(visible.probabilities[order]).tolist()
+    radius = 1.6  # of a landmark, in pixels of the picture
     for (x, y), color in zip(visible.pixels[order] * scale, colors, strict=True):
-        draw.ellipse((x - DOT_PX, y - DOT_PX, x + DOT_PX, y + DOT_PX), fill=tuple(color))
+        draw.ellipse((x - radius, y - radius, x + radius, y + radius), fill=tuple(color))
     return np.asarray(ground)
 
 

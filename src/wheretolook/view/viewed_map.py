@@ -15,7 +15,7 @@ from safetensors import SafetensorError, safe_open
 from scipy.spatial import cKDTree
 
 from wheretolook.dataset.layout import Dataset, SceneFolder, find_scene
-from wheretolook.dataset.scene import ColmapFiles, Scene, SceneConfig
+from wheretolook.dataset.scene import ColmapFiles, Scene
 from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.lattices import direction_lattice
 from wheretolook.geometry.poses import Float, camera_centers
@@ -40,7 +40,7 @@ if TYPE_CHECKING:  # torch and Warp are imported when first needed: the page ope
 
 FIRST_CELLS = 12  # scored before a floor is drawn
 
-CONFIG = SceneConfig(occlusion_cache_bytes=1 << 26)  # memory for lines of sight
+CACHE_BYTES = 1 << 26  # memory for lines of sight
 BLOCK = 1 << 10  # labelled views scored per step
 MAX_SCORERS = 8  # kept in memory; those of large maps take 100 MB each
 
@@ -370,7 +370,9 @@ def open_map(
         ConfigError: there is no such camera.
         WeightsError: the weights cannot be used.
     """
-    scene = Scene.of_colmap(ColmapFiles(path, mesh, frame=frame, mesh_up=mesh_up), camera, config=CONFIG, device=device)
+    scene = Scene.of_colmap(
+        ColmapFiles(path, mesh, frame=frame, mesh_up=mesh_up), camera, device=device, cache_bytes=CACHE_BYTES
+    )
     landmarks = scene.landmarks
     if len(landmarks) == 0:
         raise MapError("the map has no landmarks", path=path, fix="Map it again.")
@@ -396,7 +398,7 @@ def open_scene(
     if not files.landmarks.is_file():
         raise MapError("this scene has no map yet", path=files.map, fix="Run `wheretolook map` for its dataset.")
     number, own_camera = next(iter(files.cameras().items()))
-    scene = Scene(files, camera or own_camera, CONFIG, device)
+    scene = Scene(files, camera or own_camera, device=device, cache_bytes=CACHE_BYTES)
     landmarks = scene.landmarks
     own = {"given": or_shipped(weights)} if weights else scene_weights(files, landmarks)
     labels = None

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from tqdm.auto import tqdm
 
 from wheretolook.geometry.camera import Camera, ColmapCamera, PinholeCamera
-from wheretolook.geometry.poses import Float
+from wheretolook.geometry.poses import Float, as_points
 from wheretolook.utils.devices import fitting, in_threads
 from wheretolook.utils.errors import ConfigError, SceneError
 from wheretolook.utils.processes import cores
@@ -155,7 +155,7 @@ class FrustumCounter:
         Counts, landmarks (N,) of vec3d and mask (L, N) of bool are Warp arrays on the device; without a mask all lines
         of sight are free. Raises a ConfigError for more than `max_locations`; `survey` divides them into blocks.
         """
-        at = np.asarray(locations, dtype=np.float64).reshape(-1, 3)
+        at = as_points(locations)
         if len(at) > (most := self.max_locations(points.shape[0])):
             raise ConfigError("too many locations at once", value=len(at), fix=f"Give at most {most}, or use survey.")
         counts: Any = wp.zeros((len(at), len(self.rotations)), dtype=wp.int32, device=self.device)
@@ -281,7 +281,7 @@ class FrustumLister(FrustumCounter):
         Landmarks (N,) of vec3d and mask (L, N) of bool are Warp arrays on the device; without a mask all lines of sight
         are free.
         """
-        at = np.asarray(locations, dtype=np.float64).reshape(-1, 3)
+        at = as_points(locations)
         n_cells = self.size**2 + 1
         landmarks, places = self._sorted(at, points, unoccluded)
         rows: Any = wp.empty(int(landmarks.starts[len(at) * n_cells :].numpy()[0]), dtype=wp.int32, device=self.device)
@@ -373,10 +373,10 @@ def survey(
         SceneError: there are no locations, or `OcclusionModel.check` refuses one.
         ConfigError: a single location takes more memory than allowed, or the counts more than there is.
     """
-    at = np.asarray(locations, dtype=np.float64).reshape(-1, 3)
+    at = as_points(locations)
     if len(at) == 0:
         raise SceneError("there are no locations to look from", value=0, fix="Refine the grid or check the bounds.")
-    positions = points.positions if isinstance(points, DevicePoints) else np.asarray(points, np.float64).reshape(-1, 3)
+    positions = points.positions if isinstance(points, DevicePoints) else as_points(points)
     occlusion.check(at, positions)
     landmarks = points if isinstance(points, DevicePoints) else DevicePoints(positions, options.device)
     n_points = len(landmarks)

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
 from wheretolook.geometry.camera import Camera, ColmapCamera, PinholeCamera
-from wheretolook.geometry.poses import Float, split_poses
+from wheretolook.geometry.poses import Float, split_poses, unit
 from wheretolook.utils.devices import in_threads
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.processes import cores
@@ -111,8 +111,7 @@ def _rays_of_image(camera: ColmapCamera) -> tuple[Float, NDArray[np.bool_]]:
 def _border_between(camera: ColmapCamera, seen: Float, unseen: Float) -> Float:
     """Points (n, 3) on the border of the field of view between unit directions (n, 3) in and out of view."""
     for _ in range(20):  # of the gap between neighbouring centres: to 1e-8 rad
-        middle = seen + unseen
-        middle /= np.linalg.norm(middle, axis=1, keepdims=True)
+        middle = unit(seen + unseen)
         is_seen = camera.sees(middle)[:, None]
         seen = np.where(is_seen, middle, seen)
         unseen = np.where(is_seen, unseen, middle)
@@ -123,21 +122,27 @@ def octahedral_directions(u: ArrayLike, v: ArrayLike) -> Float:
     """Directions (..., 3) with |x| + |y| + |z| = 1 of points (u, v) of the octahedral map, each in [-1, 1]."""
     u, v = np.broadcast_arrays(np.asarray(u, dtype=np.float64), np.asarray(v, dtype=np.float64))
     z = 1 - np.abs(u) - np.abs(v)
-    sign_u = np.where(u >= 0, 1.0, -1.0)
-    sign_v = np.where(v >= 0, 1.0, -1.0)
-    x = np.where(z >= 0, u, (1 - np.abs(v)) * sign_u)
-    y = np.where(z >= 0, v, (1 - np.abs(u)) * sign_v)
-    return np.stack([x, y, z], axis=-1)
+    return np.stack([*_folded(u, v, z), z], axis=-1)
+
+
+def _folded(a: Float, b: Float, z: Float) -> tuple[Float, Float]:
+    """Coordinates (...), those of the lower half of the octahedron (z < 0) folded over the edges; its own inverse."""
+    across_a = (1 - np.abs(b)) * np.where(a >= 0, 1.0, -1.0)
+    across_b = (1 - np.abs(a)) * np.where(b >= 0, 1.0, -1.0)
+    return np.where(z >= 0, a, across_a), np.where(z >= 0, b, across_b)
+
+
+def cell_corners(size: int) -> Float:
+    """Unit directions (size + 1, size + 1, 3) of the corners of cells."""
+    edge = np.arange(size + 1) / size * 2 - 1
+    return unit(octahedral_directions(edge[None, :], edge[:, None]))
 
 
 def cell_centers(size: int) -> tuple[Float, Float]:
     """Unit directions (size^2, 3) of cells' centres, and the angle (size^2,) rad from each to its farthest corner."""
     middle = (np.arange(size) + 0.5) / size * 2 - 1
-    edge = np.arange(size + 1) / size * 2 - 1
-    centers = octahedral_directions(middle[None, :], middle[:, None])
-    corners = octahedral_directions(edge[None, :], edge[:, None])
-    centers /= np.linalg.norm(centers, axis=-1, keepdims=True)
-    corners /= np.linalg.norm(corners, axis=-1, keepdims=True)
+    centers = unit(octahedral_directions(middle[None, :], middle[:, None]))
+    corners = cell_corners(size)
     chords = [np.linalg.norm(centers - corners[i : i + size, j : j + size], axis=-1) for i in (0, 1) for j in (0, 1)]
     return np.asarray(centers.reshape(-1, 3)), 2 * np.arcsin(np.max(chords, axis=0) / 2).reshape(-1)
 
@@ -146,11 +151,7 @@ def cells_of(directions: ArrayLike, size: int) -> NDArray[np.int64]:
     """Cells (...) of directions (..., 3) of any length but zero: what `cell_of` in the kernels computes, in NumPy."""
     at = np.asarray(directions, dtype=np.float64)
     x, y, z = np.moveaxis(at / np.abs(at).sum(-1, keepdims=True), -1, 0)
-    sign_x = np.where(x >= 0, 1.0, -1.0)
-    sign_y = np.where(y >= 0, 1.0, -1.0)
-    u = np.where(z >= 0, x, (1 - np.abs(y)) * sign_x)
-    v = np.where(z >= 0, y, (1 - np.abs(x)) * sign_y)
-    column, row = (np.clip(((part + 1) / 2 * size).astype(np.int64), 0, size - 1) for part in (u, v))
+    column, row = (np.clip(((part + 1) / 2 * size).astype(np.int64), 0, size - 1) for part in _folded(x, y, z))
     return row * size + column
 
 

@@ -14,7 +14,7 @@ from wheretolook.utils.devices import in_threads
 from wheretolook.utils.errors import MapError, SceneError, check_range
 from wheretolook.utils.processes import cores
 from wheretolook.visibility.config import OcclusionConfig
-from wheretolook.visibility.frustum import cells_of, octahedral_directions
+from wheretolook.visibility.frustum import cell_corners, cells_of
 from wheretolook.visibility.occlusion import OcclusionInputs, OcclusionModel
 
 LEAST_POINTS = 50_000  # of fewer, the hull of all takes no longer
@@ -49,9 +49,7 @@ def _least_lengths(hull: ConvexHull, size: int) -> Float:
     cell meets it. If these points are h or more from the origin, and their directions at most an angle a apart, mixes
     w have a squared length of at least h^2 times the sum of w_i w_j cos(a), which is h^2 cos(a).
     """
-    edge = np.arange(size + 1) / size * 2 - 1
-    corners = octahedral_directions(edge[None, :], edge[:, None])
-    corners /= np.linalg.norm(corners, axis=-1, keepdims=True)
+    corners = cell_corners(size)
     lengths = _least_hull_lengths(hull, corners.reshape(-1, 3)).reshape(size + 1, size + 1)
     parts = [(slice(i, i + size), slice(j, j + size)) for i in (0, 1) for j in (0, 1)]
     pairs = [(a, b) for number, a in enumerate(parts) for b in parts[:number]]

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
 from wheretolook.geometry.lattices import fibonacci_sphere
-from wheretolook.geometry.poses import Float
+from wheretolook.geometry.poses import Float, as_points
 from wheretolook.geometry.tsdf import TsdfVolume
 from wheretolook.rendering.raycasting import MeshRaycaster
 from wheretolook.utils.errors import MapError, SceneError, TableError, check_range
@@ -35,7 +35,7 @@ class DevicePoints:
     """
 
     def __init__(self, positions: ArrayLike, device: str = "cpu") -> None:
-        self.positions = np.asarray(positions, dtype=np.float64).reshape(-1, 3)
+        self.positions = as_points(positions)
         self.device = start_warp(device)
         self.order = np.argsort(morton_codes(self.positions), kind="stable")
         self._single: dict[tuple[float, ...], Any] = {}
@@ -124,7 +124,7 @@ class OcclusionModel(ABC):
         """
         if len(points) == 0:
             raise MapError("the map has no landmarks", value=0, fix="Map the scene with more or sharper images.")
-        at = np.asarray(locations, dtype=np.float64).reshape(-1, 3)
+        at = as_points(locations)
         infinite = at[~np.isfinite(at).all(axis=-1)]
         if len(infinite):
             raise SceneError("a location is not finite", value=infinite[0].tolist())
@@ -186,7 +186,7 @@ class MeshOcclusion(OcclusionModel):
 
     def inside_geometry(self, locations: Float) -> NDArray[np.bool_]:
         """Whether locations (L, 3) m are on a surface, within 1 mm, or, in a one-sided mesh, surrounded mostly by backs; (L,)."""
-        at = np.asarray(locations, dtype=np.float64).reshape(-1, 3)
+        at = as_points(locations)
         inside = self.raycaster.distance_to_surface(at, 1e-3) <= 1e-3
         if not self.two_sided:
             _, backs = self._sides_seen(at)
@@ -277,7 +277,7 @@ class CachedOcclusion(OcclusionModel):
 
     def unoccluded(self, locations: Float, points: Float) -> NDArray[np.bool_]:
         """Mask (L, N) of the model, from the cache where possible."""
-        at = np.asarray(locations, dtype=np.float64).reshape(-1, 3)
+        at = as_points(locations)
         of_points = len(points), float(np.sum(points))  # differ between sets of landmarks
         keys = [(*of_points, *key) for key in (np.round(at, 5) + 0.0).tolist()]
         new = [row for row, key in enumerate(keys) if key not in self._known]
@@ -320,7 +320,7 @@ class TsdfOcclusion(MeshOcclusion):
 
     def __init__(self, volume: TsdfVolume, margin_m: float = 0.05, device: str = "cpu") -> None:
         super().__init__(MeshRaycaster(volume.surface(), device), margin_m)
-        self._too_close_m = volume.config.voxel_size_m / 2
+        self._too_close_m = volume.voxel_size_m / 2
 
     @classmethod
     def from_inputs(cls, inputs: OcclusionInputs) -> TsdfOcclusion:
@@ -333,7 +333,7 @@ class TsdfOcclusion(MeshOcclusion):
         A location is behind surfaces if more of the 32 rays around it meet a back than a front: it is in furniture or a
         wall, or outside of the observed space. If no ray meets a surface, the location counts as free.
         """
-        at = np.asarray(locations, dtype=np.float64).reshape(-1, 3)
+        at = as_points(locations)
         fronts, backs = self._sides_seen(at)
         behind = backs.sum(1) > fronts.sum(1)
         close = self.raycaster.distance_to_surface(at, self._too_close_m) <= self._too_close_m

@@ -31,9 +31,7 @@ def log_comparison(
 ) -> str:
     """Log a comparison as a run with files and nested runs; return its id. `about` are tags of the run alone."""
     with start_run(tracking, name, stage, dict(params), tags={**(tags or {}), **(about or {})}) as (client, run):
-        log(client, run, metrics=metrics)
-        for file in files:
-            client.log_artifact(run, str(file))
+        log(client, run, metrics=metrics, files=files)
         log_nested(tracking, run, stage, nested, tags)
     return run
 

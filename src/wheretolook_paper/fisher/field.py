@@ -9,12 +9,13 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike, NDArray
 
-from wheretolook.geometry.pose_information import N_NUMBERS, TRACE
+from wheretolook.geometry.pose_information import N_NUMBERS
 from wheretolook.geometry.poses import Float
 from wheretolook.utils.warp import start_warp
 from wheretolook_paper.fisher import field_kernel
 from wheretolook_paper.fisher.exact import run_in_parts
 from wheretolook_paper.fisher.field_kernel import numbers_kernel, process_kernel, quadratic_kernel, vec16
+from wheretolook_paper.fisher.metrics import TRACE
 from wheretolook_paper.fisher.soft_visibility import GaussianProcessVisibility, QuadraticVisibility, SoftVisibility
 
 NEAREST_M = 1e-3  # landmarks nearer to a location than this are left out: their information has no bound

@@ -8,13 +8,15 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike
 
-from wheretolook.geometry.pose_information import N_NUMBERS, TRACE
+from wheretolook.geometry.pose_information import N_NUMBERS
 from wheretolook.geometry.poses import Float
 from wheretolook.utils.warp import start_warp
 from wheretolook_paper.fisher import metrics_kernel
 from wheretolook_paper.fisher.exact import run_in_parts
 from wheretolook_paper.fisher.metrics_kernel import eigenvalues_kernel
 
+TRACE = np.zeros(N_NUMBERS)  # weights (15,) whose product with the numbers of a matrix is its trace
+TRACE[[0, 3, 5, 9, 12, 14]] = 1
 METRICS = ("mineig", "logdet", "trace")
 
 

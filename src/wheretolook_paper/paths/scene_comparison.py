@@ -144,8 +144,8 @@ class SceneComparison:
     def _paths_key(self) -> str:
         files = self.scene.folder
         settings = {name: value for name, value in asdict(self.config).items() if name not in _REPORT_OPTIONS}
-        scene = self.scene.config
-        environment = [asdict(scene.free_space), asdict(scene.occlusion), self.scene.camera.record()]
+        scene = self.scene
+        environment = [asdict(scene.free_space), asdict(scene.given_occlusion), scene.camera.record()]
         inputs = (files.mesh, files.landmarks, files.mapping_cameras, *self.weights.values())
         fingerprints = [fingerprint(path) if path and path.is_file() else None for path in inputs]
         return cache_key("paths 3", [settings, *environment, *fingerprints])

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from wheretolook.dataset.config import SampleConfig
 from wheretolook.dataset.layout import Dataset
 from wheretolook.dataset.sampling import free_locations
-from wheretolook.dataset.scene import Scene, SceneConfig
+from wheretolook.dataset.scene import Scene
 from wheretolook.dataset.viewpoint_table import UNLABELLED, is_good, poses
 from wheretolook.geometry.lattices import VoxelGrid
 from wheretolook.geometry.poses import Float, poses_looking_along, rotation_looking_along
@@ -151,11 +151,12 @@ def open_showcase(dataset: Dataset, name: str | None = None) -> Showcase:
     if seeded is None:
         raise SceneError("this scene was not generated from a seed", path=scene.folder, value=scene.name)
     occlusion = from_record(OcclusionConfig, {**settings["occlusion"], "model": "mesh"})
-    config = SceneConfig(occlusion, from_record(FreeSpaceConfig, settings["scenes"]["free_space"]))
+    free_space = from_record(FreeSpaceConfig, settings["scenes"]["free_space"])
     kind = cast(SceneKind, seeded[1])
     apartment = from_record(ApartmentConfig, settings["scenes"]["apartment"])
     mesh, _ = generate_scene(kind, apartment, int(seeded[2]))
-    showcase = Showcase(scene, None, config, "cpu", mesh=mesh)
+    showcase = Showcase(scene, None, occlusion, free_space)
+    showcase.mesh = mesh
     showcase.sampling = from_record(SampleConfig, settings["sample"])
     if settings["occlusion"]["model"] == "mesh":
         _check_same(showcase)

@@ -61,7 +61,7 @@ from wheretolook.mapping.colmap_model import colmap_poses, holds_model, read_mod
 from wheretolook.mapping.config import MapConfig
 from wheretolook.mapping.feature_files import read_features
 from wheretolook.mapping.landmarks import Landmarks, load_colmap_landmarks
-from wheretolook.mapping.map_folder import DATABASE_FILE, IMAGES_FOLDER, MapRun
+from wheretolook.mapping.map_folder import DATABASE_FILE, MapRun
 from wheretolook.mapping.photographs import read_photograph
 from wheretolook.mapping.triangulation import triangulate_model
 from wheretolook.scenes.config import SceneKind
@@ -190,7 +190,7 @@ def render_set(source: str, locations: int, images: int, work: Path, workers: in
     rows = np.unique([pd.Series(values).groupby(places).idxmax() for values in scores.values()])
     model = read_model(scene.map)
     names = [*registered_names(model).values()]
-    shutil.copytree(scene.map / IMAGES_FOLDER, out / "images", dirs_exist_ok=True)
+    shutil.copytree(scene.map / "images", out / "images", dirs_exist_ok=True)
     queries = {f"query-{row:05d}.png": pose for row, pose in zip(rows, poses_of_table(table)[rows], strict=True)}
     renderer = Scene(scene, device=device).renderer
     for name, pose in tqdm(queries.items(), desc="render queries"):

@@ -22,7 +22,6 @@ from wheretolook.dataset.config import Accuracy
 from wheretolook.evaluation.statistics import expected_calibration_error
 from wheretolook.geometry.poses import Float
 from wheretolook.localization.confidence import (
-    FEATURE_NAMES,
     MIN_INLIERS,
     RIGHT_PLACE_LIMITS,
     ConfidenceModel,
@@ -92,7 +91,7 @@ def main(poses: tuple[Path, ...]) -> None:
         print(f"{accuracy[0]} m, {accuracy[1]} degrees: {good.mean():.3f} right; {numbers}; right {right}")
     model = fit(table)
     errors = {name: vars(error) for name, error in zip(("position", "orientation"), model.errors, strict=True)}
-    weights = dict(zip(FEATURE_NAMES, model.weights, strict=True))
+    weights = dict(zip(model.names, model.weights, strict=True))
     print(json.dumps({"weights": weights, "bias": model.bias, "errors": errors}, indent=2))
 
 

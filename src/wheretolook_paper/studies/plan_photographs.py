@@ -167,7 +167,7 @@ def main(
     source = open_map(model, features, name, frame)
     scene = Scene.of_colmap(ColmapFiles(model, frame=frame), device=device)
     if ends is None:
-        reach_m = 2 * scene.config.mapped_space.max_camera_distance_m
+        reach_m = 2 * scene.mapped_space_config.max_camera_distance_m
         rows = farthest_ends(scene.space, camera_centers(source.poses), reach_m)
     else:
         rows = source.names.index(ends[0]), source.names.index(ends[1])

@@ -3,10 +3,11 @@
 import numpy as np
 
 from wheretolook.geometry.camera import ColmapCamera, PinholeCamera
-from wheretolook.geometry.pose_information import TRACE, bearing_numbers, information_matrices
+from wheretolook.geometry.pose_information import bearing_numbers, information_matrices
 from wheretolook.geometry.poses import poses_looking_along, transform
 from wheretolook.visibility.frustum import LandmarkSets, PosedViews
 from wheretolook_paper.fisher.exact import exact_information, exact_information_plain
+from wheretolook_paper.fisher.metrics import TRACE
 
 
 def test_information_is_that_of_the_plain_twin(random_views, device):

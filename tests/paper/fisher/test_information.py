@@ -6,8 +6,8 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from paper.fisher.twins import eigenvalues_plain, information_matrices
-from wheretolook.geometry.pose_information import TRACE, bearing_numbers
-from wheretolook_paper.fisher.metrics import eigenvalues, metric_of, metric_of_eigenvalues
+from wheretolook.geometry.pose_information import bearing_numbers
+from wheretolook_paper.fisher.metrics import TRACE, eigenvalues, metric_of, metric_of_eigenvalues
 
 
 def turn_of(vector):

@@ -205,10 +205,10 @@ def fill_database(database: Path, model: Any, stored: Iterable[Stored], kind: De
             db.write_camera(camera, use_camera_id=True)
         for rig in model.rigs.values():
             db.write_rig(rig, use_rig_id=True)
+        for frame in model.frames.values():
+            db.write_frame(frame, use_frame_id=True)
         for image_id, (pixels, descriptors) in zip(sorted(model.images), stored, strict=True):
-            image = model.images[image_id]
-            db.write_frame(image.frame, use_frame_id=True)
-            db.write_image(image, use_image_id=True)
+            db.write_image(model.images[image_id], use_image_id=True)
             db.write_keypoints(image_id, pixels)
             if not kind.in_bytes:
                 descriptors = descriptors.astype("<f4").view(np.uint8).reshape(len(descriptors), kind.columns)

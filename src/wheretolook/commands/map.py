@@ -252,12 +252,10 @@ def _extend(options: BuildMap, scene: SceneFolder, log: Log) -> BuildMap:
     assert source is not None and images is not None
     extended = scene.folder / EXTENDED
     database = extended / DATABASE_FILE
-    if options.database is not None:
-        existing(options.database, MapError, "map")
-    files = [path for path in source.rglob("*") if path.is_file()]
-    files += [*filter(None, [options.database]), *(images / name for name in list_photographs(images, 1))]
+    files = [*source.rglob("*"), *(images / name for name in list_photographs(images, 1))]
+    files += filter(None, [options.database])
     config = replace(options.photographs, extractor=options.extractor)
-    key = cache_key("extend", config.record(), options.extractor.record(), _seed(scene), size_and_time(files))
+    key = cache_key("extend", config.record(), options.extractor.record(), size_and_time(filter(Path.is_file, files)))
     cache = ArtifactCache(extended, key, "extend", "steps.json")
     if not cache.is_current(database, extended / REPORT_FILE):
         from wheretolook.mapping.extended_map import extend_map  # loads pycolmap
@@ -266,24 +264,14 @@ def _extend(options: BuildMap, scene: SceneFolder, log: Log) -> BuildMap:
             source, config, extended, options.database, _seed(scene), options.n_workers, options.warp_device
         )
         cache.store()
-        new = f"{report.n_new_landmarks:,} new landmarks, {report.n_extended_landmarks:,} with more observations"
-        log(f"{scene.name}: {report.n_placed} of {report.n_photographs} photographs placed, {new} -> {extended}")
-        if report.skipped:
-            log(f"{scene.name}: already in the map: {', '.join(report.skipped)}")
-        for one in report.unplaced:
-            log(f"{scene.name}: not placed: {one.describe()}")
-    number = options.camera_id
-    if number is None:
-        number = _most_used_camera(read_model(extended))
-    return replace(
-        options,
-        extend=None,
-        model=extended,
-        database=database,
-        camera_id=number,
-        photographs=PhotographsConfig(),
-        scene=scene.name,
-    )
+        placed = f"{report.n_placed} of {report.n_photographs} photographs placed, {len(report.skipped)} known before"
+        landmarks = f"{report.n_new_landmarks:,} new landmarks, {report.n_extended_landmarks:,} seen more often"
+        log(f"{scene.name}: {placed}; {landmarks} -> {extended}")
+        for name, reason in report.unplaced.items():
+            log(f"{scene.name}: not placed: {name}: {reason}")
+    number = options.camera_id or _most_used_camera(read_model(extended))
+    result = replace(options, extend=None, model=extended, database=database, camera_id=number)
+    return replace(result, photographs=PhotographsConfig(), scene=scene.name)
 
 
 def _map_photographs(options: BuildMap, scene: SceneFolder, log: Log) -> SceneFolder:

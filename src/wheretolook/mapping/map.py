@@ -157,21 +157,21 @@ def _kind_or_problem(path: Path, reconstruction: Any) -> tuple[DescriptorKind | 
     return kind, "" if kind else f"{path} has no descriptors of a known kind"
 
 
-def extractor_of(map_dir: Path, features: str = "") -> ExtractorConfig:
+def extractor_of(map_dir: Path, kind: DescriptorKind | None) -> ExtractorConfig:
     """Return the extractor in the report of a map of this project, or the first one with descriptors of a kind.
 
-    `features` is the name of the kind; "" for any, by default SIFT. Raises MapError if none of it can be run.
+    None is any kind, without a report SIFT. Raises MapError if none of it can be run.
     """
     with suppress(OSError, ValueError, KeyError, TypeError):
         stated: Any = read_json_object(map_dir / REPORT_FILE)["config"]["extractor"]
         recorded = from_record(ExtractorConfig, stated)
-        if features in ("", kind_of(recorded.method).name):  # not if the descriptors come from elsewhere
+        if kind in (None, kind_of(recorded.method)):  # not if the descriptors come from elsewhere
             return recorded
     for name in runnable_extractors():
-        if features in ("", kind_of(name).name):
+        if kind in (None, kind_of(name)):
             return ExtractorConfig(name)
     problem = "no extractor for the descriptors of this map can be run here"
-    raise MapError(problem, path=map_dir, value=features, fix="Map with SIFT, ALIKED, DISK or XFeat.")
+    raise MapError(problem, path=map_dir, value=kind and kind.name, fix="Map with SIFT, ALIKED, DISK or XFeat.")
 
 
 def source_of_map(map_dir: Path) -> Path | None:

@@ -121,8 +121,9 @@ def match_and_map(
         database.unlink(missing_ok=True)
         shutil.rmtree(folder, ignore_errors=True)
         with storing_in_database(database):
-            fill_database(database, _unposed_model(features, cameras), features.stored, features.kind)
-            write_matches(database, arrays["pairs"], matches)
+            model = _unposed_model(features, cameras)
+            fill_database(database, model, features.stored, features.kind)
+            write_matches(database, arrays["pairs"], matches, sorted(model.images))
             results = cache.store({"sparse.json": _reconstruct(database, folder, cameras, seed, run)})
     return MappedPhotographs(read_model(folder), database, **results["sparse.json"])
 

@@ -121,7 +121,7 @@ class ImageLocalizer:
         assert opened.images is not None
         learned = not KINDS[landmarks.features].in_bytes
         features = database or (find_features(path) if lightglue or learned else None)
-        extractor = extractor or extractor_of(path, landmarks.features)
+        extractor = extractor or extractor_of(path, KINDS[landmarks.features])
         of_images = None if pairs is None else ImagePairs.read(pairs, opened.images)
         result = cls(landmarks, opened.frame, QueryImages(opened), extractor, device, of_images, lightglue, features)
         _ = (

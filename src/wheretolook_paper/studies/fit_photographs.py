@@ -119,8 +119,9 @@ def read_views(data: Path, name: str) -> pd.DataFrame:
 
 def fit(views: pd.DataFrame, real: tuple[str, ...]) -> PhotographModel:
     """Fit both factors, with the same weight for every map, and `REAL` for those of real photographs."""
-    weight = 1 / views.groupby("map")["place"].transform("size") * np.where(views["map"].isin(real), REAL, 1)
-    weight = (weight / weight.mean()).to_numpy()
+    sizes = views.groupby("map")["place"].transform("size").to_numpy(np.float64)
+    weight = np.where(views["map"].isin(real), REAL, 1.0) / sizes
+    weight /= weight.mean()
     place = views["place"].to_numpy(bool)
     features = views[list(PhotographModel.names)].to_numpy()
     logistic = LogisticRegression(C=1e3, max_iter=3000).fit(features, place, weight)

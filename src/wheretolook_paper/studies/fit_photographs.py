@@ -54,7 +54,7 @@ CAMERAS = {
     "video": (640, 360, 75, 60, 0.3, 0.3),
 }
 TESTED: tuple[tuple[float, float], ...] = (ACCURACY, (0.25, 2.0))
-REAL = 4.0  # weight of a map of real photographs: there are eight of them, and 64 of rendered walks
+REAL = 16.0  # weight of a place of real photographs, over that of a rendered walk: there are six and 65 of them
 
 
 def walks(meshes: Path, out: Path, device: str = "cpu") -> None:
@@ -118,9 +118,11 @@ def read_views(data: Path, name: str) -> pd.DataFrame:
 
 
 def fit(views: pd.DataFrame, real: tuple[str, ...]) -> PhotographModel:
-    """Fit both factors, with the same weight for every map, and `REAL` for those of real photographs."""
-    sizes = views.groupby("map")["place"].transform("size").to_numpy(np.float64)
-    weight = np.where(views["map"].isin(real), REAL, 1.0) / sizes
+    """Fit both factors: each rendered walk has the same weight, and each real place `REAL` times that."""
+    is_real = views["map"].isin(real)
+    together = views["map"].str.split("_").str[0].where(is_real, views["map"])
+    sizes = views.groupby(together)["place"].transform("size").to_numpy(np.float64)
+    weight = np.where(is_real, REAL, 1.0) / sizes
     weight /= weight.mean()
     place = views["place"].to_numpy(bool)
     features = views[list(PhotographModel.names)].to_numpy()

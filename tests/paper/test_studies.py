@@ -3,12 +3,10 @@
 import numpy as np
 import pandas as pd
 import pytest
-from scipy.special import expit
 
 from scorers.test_accuracy import MODEL, views
-from wheretolook.scorers.set.network import VIEW_STATISTICS
+from wheretolook.scorers.set.accuracy import STATISTICS
 from wheretolook_paper.studies import fit_accuracy
-from wheretolook_paper.studies.calibrate_photographs import fitted_offset
 
 
 def test_the_fit_finds_the_model_that_errors_are_drawn_from(monkeypatch):
@@ -20,7 +18,7 @@ def test_the_fit_finds_the_model_that_errors_are_drawn_from(monkeypatch):
     # shrunk, so that no error at the right place exceeds its limits
     errors = np.exp(MODEL.log_errors(statistics) + noise - 12)
     errors[~place] = np.inf
-    table = pd.DataFrame(statistics, columns=VIEW_STATISTICS).assign(
+    table = pd.DataFrame(statistics, columns=STATISTICS).assign(
         own=own, scene="one", error_m=errors[:, 0], error_deg=errors[:, 1]
     )
     monkeypatch.setattr(fit_accuracy, "LEAST", (0.0, 0.0))
@@ -29,14 +27,3 @@ def test_the_fit_finds_the_model_that_errors_are_drawn_from(monkeypatch):
     for error, known in zip(found.errors, MODEL.errors, strict=True):
         assert error.weights == pytest.approx(known.weights, abs=0.03)
         assert (error.bias + 12, error.deviation) == pytest.approx((known.bias, known.deviation), abs=0.1)
-
-
-def test_the_offset_of_several_places_is_fitted_with_equal_weights():
-    """Probabilities that are too low by 1 in log-odds on one place and by 0 on one of ten times the views."""
-    rng = np.random.default_rng(0)
-    places = []
-    for shift, n in ((1.0, 20_000), (0.0, 200_000)):
-        log_odds = rng.normal(size=n)
-        places.append((log_odds, rng.random(n) < expit(log_odds + shift)))
-    assert fitted_offset(places[:1]) == pytest.approx(1.0, abs=0.05)
-    assert fitted_offset(places) == pytest.approx(0.5, abs=0.05)

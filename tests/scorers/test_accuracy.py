@@ -20,8 +20,7 @@ from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.colmap_model import write_model
 from wheretolook.mapping.map import Map
 from wheretolook.scorers.registry import find, make_scorer
-from wheretolook.scorers.set.accuracy import STATISTICS, AccuracyModel, LogError
-from wheretolook.scorers.set.network import VIEW_STATISTICS
+from wheretolook.scorers.set.accuracy import STATISTICS, AccuracyModel, LogError, PhotographModel
 from wheretolook.scorers.set.score import SetScorer
 from wheretolook.scorers.weights import load_scorer
 from wheretolook.select.where_to_look import WhereToLook
@@ -37,21 +36,21 @@ MODEL = AccuracyModel((1.0, 0.5), 0.2, (LogError((0.1, 0.2, -0.3), -4.0, 0.9), L
 def views(n=200):
     """Statistics as of views with few to many landmarks."""
     rng = np.random.default_rng(0)
-    statistics = np.zeros((n, len(VIEW_STATISTICS)))
+    statistics = np.zeros((n, len(STATISTICS)))
     for name, low, high in (
         ("log_visible", 0, 7),
         ("log_position_variance", -8, 8),
         ("log_orientation_variance", -8, 8),
         ("log_expected_cells", 0, 5),
     ):
-        statistics[:, VIEW_STATISTICS.index(name)] = rng.uniform(low, high, n)
+        statistics[:, STATISTICS.index(name)] = rng.uniform(low, high, n)
     return statistics
 
 
 def p_within(statistics, accuracy):
     """F of `MODEL` by SciPy's log-normal distribution."""
     visible, position, orientation, cells = (
-        statistics[:, VIEW_STATISTICS.index(name)]
+        statistics[:, STATISTICS.index(name)]
         for name in ("log_visible", "log_position_variance", "log_orientation_variance", "log_expected_cells")
     )
     median_m = np.exp(position / 2 + 0.1 * visible + 0.2 * orientation - 0.3 * cells - 4)
@@ -89,29 +88,43 @@ def test_it_rises_from_0_through_the_networks_own_probability_to_the_right_place
 def test_errors_and_limits_scale_with_the_unit():
     statistics = views()
     larger = statistics.copy()
-    larger[:, VIEW_STATISTICS.index("log_position_variance")] += 2 * math.log(10)
+    larger[:, STATISTICS.index("log_position_variance")] += 2 * math.log(10)
     assert MODEL.quantiles(larger, (0.5, 0.4)) == pytest.approx(MODEL.quantiles(statistics, ACCURACY))
     assert MODEL.expected_errors(larger) == pytest.approx(MODEL.expected_errors(statistics) * (10, 1))
-    median_m = np.exp(MODEL.log_errors(statistics)[:, 0])
-    assert MODEL.expected_errors(statistics)[:, 0] == pytest.approx(lognorm(0.9, scale=median_m).mean())
 
 
-def test_the_bundled_file_is_the_model_and_damage_is_found(tmp_path):
-    stored = json.loads(AccuracyModel.file.read_text())
-    model = AccuracyModel.bundled()
-    assert dict(zip(AccuracyModel.names, model.weights, strict=True)) == stored["weights"]
+def test_on_photographs_it_is_the_product_of_both_factors_by_the_deviation_of_the_map():
+    statistics = views()
+    statistics[:, -2:] = np.random.default_rng(3).normal(-4, 1, (len(statistics), 2))
+    own = np.random.default_rng(4).uniform(0.01, 0.99, len(statistics))
+    model = PhotographModel((0.8,), 0.1, (LogError((), 0.9, 1.1), LogError((), 0.7, 1.0)))
+    odds = (own / (1 - own)) ** 0.8 * np.exp(0.1)
+    median_m, median_deg = np.exp(statistics[:, -2:] + (0.9, 0.7)).T
+    for metres, degrees in ACCURACIES:
+        within = lognorm(1.1, scale=median_m).cdf(metres), lognorm(1.0, scale=median_deg).cdf(degrees)
+        found = model.at((metres, degrees), ACCURACY, own, statistics)
+        assert found == pytest.approx(odds / (1 + odds) * np.minimum(*within), abs=1e-9)
+    assert model.expected_errors(statistics) == pytest.approx(np.stack([median_m, median_deg], 1))
+
+
+@pytest.mark.parametrize("kind", [AccuracyModel, PhotographModel])
+def test_the_bundled_file_is_the_model_and_damage_is_found(tmp_path, kind):
+    stored = json.loads(kind.file.read_text())
+    model = kind.bundled()
+    assert type(model) is kind and dict(zip(kind.names, model.weights, strict=True)) == stored["weights"]
     for error, name in zip(model.errors, ("position", "orientation"), strict=True):
-        record = {"weights": dict(zip(STATISTICS, error.weights, strict=True)), **vars(error)}
-        assert record | {"weights": stored["errors"][name]["weights"]} == stored["errors"][name]
+        record = {**vars(error), "weights": dict(zip(kind.inputs, error.weights, strict=True))}
+        assert record == stored["errors"][name]
     del stored["errors"]["position"]["bias"]
     (tmp_path / "accuracy.json").write_text(json.dumps(stored))
     with pytest.raises(WeightsError, match="damaged"):
-        AccuracyModel.load(tmp_path / "accuracy.json")
+        kind.load(tmp_path / "accuracy.json")
 
 
-@pytest.fixture(scope="module")
-def scorer():
-    scorer = load_scorer(LocalizationMap(Map(make_landmarks(np.random.default_rng(0), 400)), CAMERA))
+@pytest.fixture(scope="module", params=[False, True], ids=["renders", "photographs"])
+def scorer(request):
+    landmarks = make_landmarks(np.random.default_rng(0), 400)
+    scorer = load_scorer(LocalizationMap(Map(landmarks, has_photographs=request.param), CAMERA))
     assert isinstance(scorer, SetScorer)
     return scorer
 

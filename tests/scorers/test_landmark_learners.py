@@ -23,6 +23,8 @@ from wheretolook.scorers.set.network import (
     ViewSums,
     expected_cells,
     expected_parts,
+    mapped_deviations,
+    mapped_precision,
 )
 from wheretolook.training.data import labelled_rows
 from wheretolook.training.landmark_views import LandmarkBatches, load_landmark_views
@@ -40,6 +42,60 @@ def attributes_of(offsets):
     values[:, DISTANCE] = np.log(np.linalg.norm(offsets, axis=1))
     values[:, ATTRIBUTES.index("pixel_angle")] = -np.log(320)
     return torch.from_numpy(values)
+
+
+@pytest.mark.parametrize("aside_deg", [0, 10, 60, 90])
+def test_the_precision_of_a_track_is_that_of_its_covariance(aside_deg):
+    rng = np.random.default_rng(aside_deg)
+    focal_px, mapped_px, distance_m, mapped_m, n = 400.0, 900.0, 3.0, 5.0, 12
+    # rays to the landmark within a few degrees of the mean direction z
+    rays = np.column_stack([rng.normal(0, 0.06, n), rng.normal(0, 0.03, n), np.ones(n)])
+    rays /= np.linalg.norm(rays, axis=1)[:, None]
+    mean = rays.mean(0)
+    across = np.eye(3) - rays[:, :, None] * rays[:, None]
+    covariance = np.linalg.inv((mapped_px / mapped_m) ** 2 * across.sum(0))  # of a keypoint noise of one pixel
+    angle = np.radians(aside_deg)
+    bearing = np.array([np.sin(angle), 0, np.cos(angle)])
+    plane = np.eye(3) - np.outer(bearing, bearing)
+    variance = 1 / focal_px**2 + np.trace(plane @ covariance @ plane) / 2 / distance_m**2
+    values = torch.zeros(1, len(ATTRIBUTES))
+    for name, value in {
+        "pixel_angle": -np.log(focal_px),
+        "pixel_size_ratio": np.log(distance_m / focal_px) - np.log(mapped_m / mapped_px),
+        "mapped_angle": bearing @ mean / np.linalg.norm(mean),
+        "track_length": np.log(n),
+        "direction_spread": 1 - np.linalg.norm(mean),
+    }.items():
+        values[:, ATTRIBUTES.index(name)] = value
+    assert mapped_precision(values).item() == pytest.approx(1 / variance / 320**2, rel=0.05)
+
+
+def test_landmarks_whose_rays_do_not_meet_have_finite_precision():
+    values = torch.zeros(3, len(ATTRIBUTES))
+    values[:, ATTRIBUTES.index("direction_spread")] = torch.tensor([0.0, 1e-12, 1.0])
+    values[2, ATTRIBUTES.index("pixel_size_ratio")] = np.nan  # maps of released datasets have no focal length
+    assert mapped_precision(values).isfinite().all() and (mapped_precision(values) > 0).all()
+
+
+def test_deviations_of_a_pose_are_those_of_its_exact_covariance():
+    offsets = some_offsets(60)
+    values = attributes_of(offsets)
+    rng = np.random.default_rng(2)
+    for name, drawn in {
+        "pixel_size_ratio": rng.normal(size=60),
+        "mapped_angle": rng.uniform(0.5, 1, 60),
+        "track_length": np.log(rng.integers(2, 20, 60)),
+        "direction_spread": rng.uniform(1e-3, 0.1, 60),
+    }.items():
+        values[:, ATTRIBUTES.index(name)] = torch.from_numpy(drawn)
+    odds = torch.from_numpy(rng.normal(size=60))
+    views = ViewSums(expected_parts(values, odds).sum(0, keepdim=True), torch.tensor([60]), torch.tensor([12.0]))
+    weights = odds.sigmoid().numpy() * mapped_precision(values).numpy() * 320**2
+    matrix = information.information_matrices((weights[:, None] * information.bearing_numbers(offsets)).sum(0))
+    covariance = np.linalg.inv(matrix)
+    exact = [np.sqrt(np.trace(covariance[:3, :3])), np.degrees(np.sqrt(np.trace(covariance[3:, 3:])))]
+    found = mapped_deviations(views, SetNetwork(NO_STATISTICS).statistics_of(views))
+    assert found[0].exp().tolist() == pytest.approx(exact, rel=0.1)
 
 
 def some_offsets(n, seed=0):

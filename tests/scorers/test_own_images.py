@@ -12,7 +12,6 @@ from scipy.special import logit
 
 from selection.room import WEIGHTS, write_room
 from synthetic_dataset import make_landmarks
-from wheretolook.dataset.scene import ColmapFiles, Scene
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import camera_centers, poses_looking_along
 from wheretolook.inputs.localization_map import LocalizationMap
@@ -145,8 +144,9 @@ def test_every_occlusion_model_has_its_own():
 def test_it_is_added_for_photographs_only_and_to_a_copy():
     trained = replace(bundled(), network=constant_network())
     assert for_map(trained, observed_map(0.6, photographs=False)) is trained
-    calibrated = for_map(trained, observed_map(0.6))
-    assert calibrated.offset == trained.offset + trained.photograph_offset and calibrated.photograph_offset == 0
+    localization_map = observed_map(0.6)
+    calibrated = for_map(trained, localization_map)
+    assert calibrated.error_scale == pytest.approx(max(0.1, localization_map.landmarks.keypoint_noise_px))
     values = torch.zeros(5, len(trained.network.attributes))
     before, after = (one.network.matchability(values).sigmoid().numpy() for one in (trained, calibrated))
     assert_allclose(before, PREDICTED, rtol=1e-5)
@@ -190,26 +190,3 @@ def test_landmarks_without_an_image_are_those_of_the_smaller_model(tmp_path):
     assert_array_equal(found.track_length, expected.track_length)
     for name in ("triangulation_angle_deg", "mapping_direction", "mapping_distance_m", "mapping_distance_spread"):
         assert_allclose(getattr(found, name), getattr(expected, name), atol=1e-4)
-
-
-# Log-odds of maps of photographs have the offset of the weights once; those of maps of renders have none.
-
-
-@pytest.mark.parametrize("rendered", [True, False])
-def test_the_offset_is_added_once_and_only_for_photographs(rendered, tmp_path):
-    folder = write_room(tmp_path / "sparse", metric=rendered)  # whose report then states that it is rendered
-    trained = replace(TrainedNetwork.load(WEIGHTS / "set.safetensors", SetNetwork, "set"), photograph_offset=0.7)
-    trained.save(tmp_path / "with.safetensors")
-    replace(trained, photograph_offset=0.0).save(tmp_path / "without.safetensors")
-    TrainedNetwork.load(tmp_path / "with.safetensors", SetNetwork, "set").save(tmp_path / "again.safetensors")
-    expected = 0.0 if rendered else 0.7
-    for localization_map in (
-        LocalizationMap.from_colmap(folder),
-        Scene.of_colmap(ColmapFiles(folder)).localization_map,
-    ):
-        views = localization_map.mapping_poses
-        plain, *others = (
-            load_scorer(localization_map, tmp_path / f"{name}.safetensors") for name in ("without", "with", "again")
-        )
-        for scorer in others:
-            np.testing.assert_allclose(logit(scorer.score(views)) - logit(plain.score(views)), expected, atol=1e-6)

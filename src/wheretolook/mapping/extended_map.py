@@ -98,10 +98,17 @@ def extend_map(
         if found.given:
             fixed = {*model.cameras}
         added = sorted(model.images)[-len(names) :]
+        written = folder / DATABASE_FILE
         with run.clock("match"):
-            _match(folder / DATABASE_FILE, model, stored, len(names), run)
+            pairs = photograph_pairs(stored, new.kind, EXHAUSTIVE_UP_TO, config.overlap)
+            pairs = pairs[pairs[:, 1] >= len(stored) - len(names)]
+            with storing_in_database(written):
+                fill_database(written, model, stored, new.kind)
+                matches = match_pairs(stored, pairs, folder, run.processes, progress, new.kind)
+                write_matches(written, pairs, matches, sorted(model.images))
+                verify_matches(written, run)
         with run.clock("register"):
-            unplaced = _register(folder / DATABASE_FILE, model, added, fixed, run)
+            unplaced = _register(written, model, added, fixed, run)
         if len(unplaced) == len(names):
             fix = "Give photographs of the same place that overlap with those of the map."
             raise MapError("none of the photographs can be placed in the map", path=images, value=unplaced, fix=fix)
@@ -148,19 +155,12 @@ def _new_names(map_dir: Path, model: Any, images: Path) -> tuple[list[str], list
 def _add_images(model: Any, new: PhotographFeatures, found: PhotographCameras) -> list[Stored]:
     """Add photographs without poses to a model, and their cameras unless exactly one of it fits.
 
-    One fits if it has the proportions of the photograph and, within 5 %, the focal length in its EXIF data: refined
-    ones differ from these by a few percent, other lenses and zooms by more. Returns keypoints at the cameras' size.
+    Returns keypoints at the size of the cameras.
     """
     known = [*model.cameras.values()]
     cameras = []
     for camera in found.cameras:
-        scales = [np.divide((one.width, one.height), (camera.width, camera.height)) for one in known]
-        focal = [mean_focal_px(one) / mean_focal_px(camera) for one in known]
-        fitting = []
-        for one, (across, down), ratio in zip(known, scales, focal, strict=True):
-            is_similar = abs(ratio / across - 1) < 0.05 or not camera.has_prior_focal_length
-            if abs(across / down - 1) < 0.01 and is_similar and not found.given:
-                fitting.append(one)
+        fitting = [one for one in known if not found.given and _fits(one, camera)]
         if len(fitting) == 1:
             (camera,) = fitting
         else:
@@ -176,16 +176,14 @@ def _add_images(model: Any, new: PhotographFeatures, found: PhotographCameras) -
     return stored
 
 
-def _match(database: Path, model: Any, stored: list[Stored], n_new: int, run: MapRun) -> None:
-    """Write a database of a model whose last images are new, and verified matches of these with all."""
-    kind = kind_of(run.config.extractor.method)
-    pairs = photograph_pairs(stored, kind, EXHAUSTIVE_UP_TO, PhotographsConfig.overlap)
-    pairs = pairs[pairs[:, 1] >= len(stored) - n_new]
-    with storing_in_database(database):
-        fill_database(database, model, stored, kind)
-        matches = match_pairs(stored, pairs, database.parent, run.processes, run.progress, kind)
-        write_matches(database, pairs, matches, sorted(model.images))
-        verify_matches(database, run)
+def _fits(known: Any, camera: Any) -> bool:
+    """Test whether a camera has the proportions of a photograph's and the focal length in its EXIF data, if there is one.
+
+    Refined focal lengths differ from those of EXIF data by a few percent, other lenses and zooms by more than 5.
+    """
+    across, down = known.width / camera.width, known.height / camera.height
+    longer = mean_focal_px(known) / mean_focal_px(camera) / across
+    return abs(across / down - 1) < 0.01 and (not camera.has_prior_focal_length or abs(longer - 1) < 0.05)
 
 
 def _register(database: Path, model: Any, added: list[int], fixed: set[int], run: MapRun) -> dict[str, str]:
@@ -213,20 +211,21 @@ def _register(database: Path, model: Any, added: list[int], fixed: set[int], run
                     mapper.iterative_local_refinement(2, 1e-3, mapping, local, triangulation, number)  # as COLMAP does
                     break
         mapper.iterative_global_refinement(5, 5e-4, mapping, overall, triangulation, False)
-        left = {image.name: number for number, image in model.images.items() if number in added and not image.has_pose}
-        seen = {name: mapper.observation_manager.num_visible_points3D(number) for name, number in left.items()}
-        partners: dict[int, list[tuple[int, str]]] = {number: [] for number in model.images}
-        for pair, n in zip(*db.read_two_view_geometry_num_inliers(), strict=True):
-            ends = pycolmap.pair_id_to_image_pair(pair)
-            for number, other in (ends, ends[::-1]):
-                image = model.images[other]
-                partners[number].append((n, f"{n} with {image.name}" + " (not placed)" * (not image.has_pose)))
+        unplaced = {}
+        for number in added:
+            image = model.images[number]
+            if image.has_pose:
+                continue
+            partners = []
+            for other in model.images.values():
+                if db.exists_two_view_geometry(number, other.image_id):
+                    n = len(db.read_two_view_geometry(number, other.image_id).inlier_matches)
+                    partners.append((n, f"{n} with {other.name}" + " (not placed)" * (not other.has_pose)))
+            best = ", ".join(text for n, text in sorted(partners, reverse=True)[:3] if n) or "none"
+            seen = mapper.observation_manager.num_visible_points3D(number)
+            needed = f"{seen} matches with landmarks, {mapping.abs_pose_min_num_inliers} that agree are needed"
+            unplaced[image.name] = f"{needed}; verified matches: {best}"
         mapper.end_reconstruction(False)  # removes what has no pose from the model
-        for number, pose in poses.items():
-            model.frames[number].rig_from_world = pose  # which is normalized by adjustments
-    unplaced = {}
-    for name, number in left.items():
-        best = ", ".join(text for n, text in sorted(partners[number], reverse=True)[:3] if n)
-        reason = f"{seen[name]} matches with landmarks, {mapping.abs_pose_min_num_inliers} that agree are needed"
-        unplaced[name] = f"{reason}; verified matches: {best or 'none'}"
+    for number, pose in poses.items():
+        model.frames[number].rig_from_world = pose  # which is normalized by adjustments
     return unplaced

@@ -64,6 +64,18 @@ class Landmarks:
     def __len__(self) -> int:
         return len(self.ids)
 
+    @property
+    def keypoint_noise_px(self) -> float:
+        """Standard deviation of a coordinate of the mapping images' keypoints, in pixels; 1 if it is unknown.
+
+        The median over landmarks of at least three observations of their mean reprojection error over that of normal
+        noise, sqrt(pi / 2). A track of n keypoints has 2 n coordinates, and determines 3.
+        """
+        known = (self.track_length >= 3) & np.isfinite(self.reprojection_error_px)
+        n = self.track_length[known].astype(np.float64)
+        noise = self.reprojection_error_px[known] * np.sqrt(4 * n / (np.pi * (2 * n - 3)))
+        return float(np.median(noise)) if len(n) else 1.0
+
     def attributes(self) -> NDArray[np.float32]:
         """`MAP_ATTRIBUTES` of each landmark, (N, len(MAP_ATTRIBUTES)) float32."""
         focal_px = self.mapping_focal_px

@@ -8,6 +8,7 @@ import json
 import warnings
 from collections.abc import Iterator
 from copy import deepcopy
+from dataclasses import replace
 from math import sqrt
 from pathlib import Path
 from typing import Any
@@ -28,7 +29,7 @@ from wheretolook.geometry.poses import Float
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.landmarks import MAP_ATTRIBUTES, Landmarks
 from wheretolook.robot.wheretolook_robot import FILES, FORMAT_VERSION, description_digest, file_digest
-from wheretolook.scorers.set.accuracy import AccuracyModel
+from wheretolook.scorers.set.accuracy import model_of, statistics_on
 from wheretolook.scorers.set.network import CELLS, SetNetwork, ViewSums, expected_parts
 from wheretolook.scorers.set.score import MAX_LANDMARKS, for_map
 from wheretolook.training.trained_network import TrainedNetwork, camera_quantities
@@ -73,10 +74,10 @@ class RobotNetwork(nn.Module):
 
     def __init__(self, trained: TrainedNetwork[SetNetwork], accuracy: Accuracy) -> None:
         super().__init__()
-        self.trained = trained
         self.accuracy = accuracy
         self.network = deepcopy(trained.network).cpu().eval()
         self.network.pose_variances = pose_variances
+        self.trained = replace(trained, network=self.network)
         # tangents of the borders of the cells, rounded up, so that no rounding of an arctangent decides
         exact = np.tan((np.arange(1, CELLS) / CELLS - 0.5) * np.pi)
         single = exact.astype(np.float32)
@@ -99,13 +100,11 @@ class RobotNetwork(nn.Module):
         own = torch.arange(values.shape[1]) < n_sampled[:, None]
         each = (n_visible.double() / n_sampled.clamp(min=1))[:, None]  # visible landmarks per sampled one
         sums = (expected_parts(values, log_odds, network.attributes).double() * own[..., None]).sum(1) * each
-        is_own = self.accuracy == self.trained.accuracy
         views = ViewSums(sums, n_visible, self._expected_cells(values, log_odds, own, each))
         probability = self.trained.calibrated(network.logits(views).double()).sigmoid()
-        if not is_own:
-            statistics = network.statistics_of(views).double()
-            model = AccuracyModel.bundled()
-            probability = model.at(self.accuracy, self.trained.accuracy, probability, statistics, torch, log_ndtr)
+        statistics = statistics_on(self.trained, views)
+        limits = self.accuracy, self.trained.accuracy
+        probability = model_of(self.trained).at(*limits, probability, statistics, torch, log_ndtr)
         return probability, sums[:, 0].float()
 
     def _expected_cells(self, values: Tensor, log_odds: Tensor, own: Tensor, each: Tensor) -> Tensor:

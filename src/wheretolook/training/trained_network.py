@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from math import isfinite
 from pathlib import Path
@@ -226,8 +226,7 @@ NetworkT = TypeVar("NetworkT", bound=StoredNetwork)
 class TrainedNetwork(Generic[NetworkT]):
     """A network and the calibration scale * logit + offset of its logits.
 
-    A network trained on rendered views predicts probabilities that are too low for most photographs:
-    `for_photographs` adds `photograph_offset` to the log-odds (docs/research/cameras.md).
+    `error_scale` is that of the poses on a map of photographs, see `scorers.set.score.for_map`; None for a map of renders.
     """
 
     method: str
@@ -237,7 +236,7 @@ class TrainedNetwork(Generic[NetworkT]):
     offset: float = 0.0
     training_range: TrainingRange | None = None  # of its training views; None if the weights do not store it
     accuracy: Accuracy = ACCURACY  # limits of its training views' errors, in metres and degrees
-    photograph_offset: float = 0.0
+    error_scale: float | None = None
 
     def __post_init__(self) -> None:
         self.network.eval()
@@ -245,10 +244,6 @@ class TrainedNetwork(Generic[NetworkT]):
     def calibrated(self, logits: Tensor) -> Tensor:
         """Return calibrated log-odds of the network's logits, in the same shape and precision."""
         return self.scale * logits + self.offset
-
-    def for_photographs(self) -> Self:
-        """Return the same network, calibrated for maps of photographs."""
-        return replace(self, offset=self.offset + self.photograph_offset, photograph_offset=0.0)
 
     def range_at(self, accuracy: Accuracy) -> TrainingRange:
         """Return the range of scores at an accuracy; without a stored one, that of the training camera."""
@@ -262,8 +257,6 @@ class TrainedNetwork(Generic[NetworkT]):
         if self.training_range is not None:
             header["range"] = self.training_range.record()
         header |= {"offset": self.offset, "training": dict(training or {})}
-        if self.photograph_offset:
-            header["photograph_offset"] = self.photograph_offset
         write_weights(path, self.method, self.network.stored.state_dict(), header)
 
     @classmethod
@@ -286,7 +279,7 @@ class TrainedNetwork(Generic[NetworkT]):
             scale = finite(header.get("scale", 1.0))
             if scale <= 0:
                 raise ValueError(f"the scale of the logits is {scale:g}")
-            offset, photograph_offset = (finite(header.get(name, 0.0)) for name in ("offset", "photograph_offset"))
+            offset = finite(header.get("offset", 0.0))
             training_range = TrainingRange.of_record(header["range"]) if "range" in header else None
             options = header.get("training", {}).get("config", {})
             names = ("max_error_m", "max_error_deg")
@@ -297,9 +290,7 @@ class TrainedNetwork(Generic[NetworkT]):
             fix = "Use the version that wrote them, or train again."
             raise WeightsError(problem, path=path, fix=fix) from error
         network.to(device).requires_grad_(False)
-        return TrainedNetwork(
-            header["method"], network, camera, scale, offset, training_range, accuracy, photograph_offset
-        )
+        return TrainedNetwork(header["method"], network, camera, scale, offset, training_range, accuracy)
 
 
 def finite(value: Any) -> float:

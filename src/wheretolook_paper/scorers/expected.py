@@ -63,7 +63,9 @@ class Expectation:
                 quantities[rows] = view_quantities(described, n_in_view, of_camera)
                 log_odds = self.log_odds(described.values)
                 parts = expected_parts(described.values, log_odds, described.attributes).double()
-                sums[rows, :16] = torch.segment_reduce(parts, "sum", lengths=described.counts, initial=0.0).cpu()
+                sums[rows, :16] = torch.segment_reduce(
+                    parts[:, :16], "sum", lengths=described.counts, initial=0.0
+                ).cpu()
                 sums[rows, 16] = self._filled_bins(described, log_odds).cpu()
             self._poses = cam_from_world.copy()
             self._sums = sums

@@ -33,7 +33,6 @@ from wheretolook.geometry.poses import Float
 from wheretolook.localization.confidence import RIGHT_PLACE_LIMITS
 from wheretolook.scorers.adapted.calibration import finite_log_odds
 from wheretolook.scorers.set.accuracy import MARGIN, STATISTICS, AccuracyModel, LogError, probabilities, statistics_of
-from wheretolook.scorers.set.network import VIEW_STATISTICS
 from wheretolook.scorers.set.score import SetScorer
 from wheretolook_paper.studies.fit_confidence import ACCURACIES, is_within
 
@@ -44,7 +43,7 @@ VIEWS = 6000  # of a scene, drawn at random
 
 
 def read_views(scene: SceneFolder, weights: Path) -> pd.DataFrame:
-    """Return errors (infinite without a pose), the network's probability `own` and `VIEW_STATISTICS` of a scene's views."""
+    """Return errors (infinite without a pose), the network's probability `own` and `STATISTICS` of a scene's views."""
     table = scene.read_table()
     table = table.sample(min(VIEWS, len(table)), random_state=0).reset_index(drop=True)
     numbers = table[CAMERA_ID] if CAMERA_ID in table else pd.Series(0, index=table.index)
@@ -56,7 +55,7 @@ def read_views(scene: SceneFolder, weights: Path) -> pd.DataFrame:
         views = poses(part)
         for rows, described, n_visible in scorer.describer.in_blocks(views, scorer.max_landmarks):
             sums = scorer.network.sums_of(described, n_visible)
-            statistics = pd.DataFrame(statistics_of(scorer.network, sums), columns=VIEW_STATISTICS)
+            statistics = pd.DataFrame(statistics_of(scorer.trained, sums), columns=STATISTICS)
             found = part.iloc[rows][["error_m", "error_deg", "status"]].reset_index(drop=True)
             own = probabilities(scorer.trained, scorer.accuracy, sums)
             parts.append(pd.concat([found, statistics], axis=1).assign(own=own, scene=scene.name))
@@ -74,7 +73,7 @@ def fit(views: pd.DataFrame) -> AccuracyModel:
     features = np.stack([finite_log_odds(views["own"].to_numpy(), MARGIN), variance], axis=-1)
     logistic = LogisticRegression(C=1e3, max_iter=2000).fit(features, place, weight)
     right = views[place]
-    features = right[list(STATISTICS)].to_numpy()
+    features = right[list(AccuracyModel.inputs)].to_numpy()
     deviation = right["log_position_variance"].to_numpy() / 2
     errors = []
     for unit, least, known in zip(("m", "deg"), LEAST, (deviation, 0 * deviation), strict=True):
@@ -88,7 +87,7 @@ def fit(views: pd.DataFrame) -> AccuracyModel:
 
 def predict(model: AccuracyModel, views: pd.DataFrame, accuracy: Accuracy) -> Float:
     """Predict the probabilities (B,) that views are within an accuracy."""
-    return model.at(accuracy, ACCURACY, views["own"].to_numpy(), views[list(VIEW_STATISTICS)].to_numpy())
+    return model.at(accuracy, ACCURACY, views["own"].to_numpy(), views[list(STATISTICS)].to_numpy())
 
 
 def compare(title: str, parts: list[tuple[AccuracyModel, pd.DataFrame]]) -> None:

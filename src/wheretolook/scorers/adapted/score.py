@@ -32,17 +32,20 @@ class AdaptedNetwork(StoredNetwork):
 
     place: torch.Tensor  # (P, 3) float64 m
 
-    def __init__(self, network: SetNetwork, scale: float, offset: float, place: int) -> None:
+    def __init__(
+        self, network: SetNetwork, scale: float, offset: float, place: int, error_scale: float | None = None
+    ) -> None:
         super().__init__()
         self.network = network
         self.base_scale = scale
         self.base_offset = offset
+        self.error_scale = error_scale
         self.register_buffer("place", torch.zeros((place, 3), dtype=torch.float64))
 
     def description(self) -> dict[str, Any]:
         """See `StoredNetwork.description`."""
         base = {"network": self.network.description(), "scale": self.base_scale, "offset": self.base_offset}
-        return {"base": base, "place": len(self.place)}
+        return {"base": base | {"error_scale": self.error_scale}, "place": len(self.place)}
 
     @classmethod
     def of_description(cls, stored: Mapping[str, Any]) -> Self:
@@ -56,7 +59,10 @@ class AdaptedNetwork(StoredNetwork):
         if not 0 <= place <= 1_000_000:  # more are no weights of this program
             raise ValueError(f"invalid number of landmarks {place}")
         network = SetNetwork.of_description(base["network"])
-        return cls(network, finite(base["scale"]), finite(base["offset"]), place)
+        error_scale = base.get("error_scale")
+        if error_scale is not None and not finite(error_scale) > 0:
+            raise ValueError(f"the scale of the errors is {error_scale:g}")
+        return cls(network, finite(base["scale"]), finite(base["offset"]), place, error_scale)
 
 
 MIN_SHARE = 0.5
@@ -100,7 +106,13 @@ class AdaptedScorer(Scorer):
         self.base = SetScorer(
             known,
             TrainedNetwork(
-                "set", network.network, trained.camera, network.base_scale, network.base_offset, trained.training_range
+                "set",
+                network.network,
+                trained.camera,
+                network.base_scale,
+                network.base_offset,
+                trained.training_range,
+                error_scale=network.error_scale,
             ),
         )
 

@@ -98,6 +98,38 @@ def bearing_precision(values: Tensor, attributes: tuple[str, ...] = ATTRIBUTES) 
     return (-2 * pixel).exp() / (1 + (-2 * ratio).exp())
 
 
+MAPPED_BY = ("mapped_angle", "track_length", "direction_spread")
+"""Attributes that the covariance of a landmark follows from, with its distances."""
+
+
+def mapped_precision(values: Tensor, attributes: tuple[str, ...] = ATTRIBUTES) -> Tensor:
+    """Return one over the variance of each landmark's bearing (...), as its track determines its position.
+
+    n rays that meet in a landmark at the mean distance d, with keypoint noise s / f, give it the covariance
+    (s d / f)^2 / n across their mean direction, and 1 / (2 e) times that along it, where e = 1 - |mean of the unit
+    directions|, to the first order in e. A camera that sees it at the angle a to that direction, at the distance D, thus
+    has the variance s^2 / f^2 + (s d / f)^2 / (n D^2) (1 + (1 / (2 e) - 1) sin^2 a / 2) on average over the two axes of
+    the image. In the unit of `bearing_precision`, for a noise of one pixel. That function counts landmarks as observed
+    once, from anywhere.
+    """
+    if not set(MAPPED_BY) <= set(attributes):
+        return bearing_precision(values, attributes)
+    cosine, log_n, spread = (values[..., attributes.index(name)] for name in MAPPED_BY)
+    pixel, ratio = (values[..., attributes.index(name)] for name in ("pixel_angle", "pixel_size_ratio"))
+    return precision_of_track(pixel, ratio, cosine, (-log_n).exp(), along(spread))
+
+
+def along(spread: Tensor) -> Tensor:
+    """Return by how much more than 1 the variance of landmarks along their mean direction is, of that across it."""
+    return 0.5 / spread.clamp(min=1e-6) - 1  # rays in one direction: 1,000 times the deviation, and finite
+
+
+def precision_of_track(pixel: Tensor, ratio: Tensor, cosine: Tensor, of_track: Tensor, excess: Tensor) -> Tensor:
+    """Return `mapped_precision` from logs of a pixel's angle and size ratio, cosine, 1 / n and `along`."""
+    landmark = (-2 * ratio.nan_to_num(nan=0.0)).exp() * of_track * (1 + excess * (1 - cosine**2) / 2)
+    return (-2 * (pixel + log(320))).exp() / (1 + landmark)
+
+
 def bearing_numbers(values: Tensor, attributes: tuple[str, ...] = ATTRIBUTES) -> Tensor:
     """Return `geometry.pose_information.bearing_numbers` (..., 15) of landmarks (..., A), along the camera's axes."""
     across, down, log_distance = (values[..., attributes.index(name)] for name in ("across", "down", "distance"))
@@ -109,14 +141,16 @@ def bearing_numbers(values: Tensor, attributes: tuple[str, ...] = ATTRIBUTES) ->
     return torch.cat([plane * inverse**2, bearing * inverse, plane], -1)
 
 
-N_EXPECTED = 16  # detection and information of a landmark, see `expected_parts`
+N_EXPECTED = 18  # detection, information and `mapped_precision` of a landmark, see `expected_parts`
 
 
 def expected_parts(values: Tensor, log_odds: Tensor, attributes: tuple[str, ...] = ATTRIBUTES) -> Tensor:
     """Return what landmarks (..., A) with log-odds of detection (...) add to a view's sums, (..., N_EXPECTED)."""
     p_detect = log_odds.sigmoid()[..., None]
     weight = p_detect * bearing_precision(values, attributes)[..., None]
-    return torch.cat([p_detect, weight * bearing_numbers(values, attributes)], -1)
+    mapped = p_detect * mapped_precision(values, attributes)[..., None]
+    squared = (2 * values[..., attributes.index("distance"), None]).exp()
+    return torch.cat([p_detect, weight * bearing_numbers(values, attributes), mapped / squared, mapped], -1)
 
 
 def information_matrices(numbers: Tensor) -> Tensor:
@@ -140,6 +174,10 @@ VIEW_STATISTICS = (
 )
 """Statistics of a view, the inputs of the head: chosen by cross-validation over the scenes of configs/cameras.yaml. With
 more it overfits its training scenes (docs/research/learners.md). None depends on the camera's axes."""
+
+MAPPED_DEVIATIONS = ("log_mapped_position_deviation", "log_mapped_orientation_deviation")
+"""Logs of the expected standard deviations of a pose by `mapped_precision`, in metres and degrees, for keypoints with a
+noise of 1 / 320 rad."""
 
 CELLS = 30
 """Cells that 180 degrees are cut into, across and down: 6 degrees each, the same for every camera."""
@@ -251,12 +289,29 @@ class SetNetwork(LandmarkNetwork):
     def statistics_of(self, views: ViewSums) -> Tensor:
         """Return `VIEW_STATISTICS` (B, S) of views."""
         # in double precision: the covariance is an inverse
-        information = information_matrices(views.sums[:, 1:].double())
+        information = information_matrices(views.sums[:, 1:16].double())
         information = information + PRIOR * torch.eye(6, device=information.device).double()
         variances = self.pose_variances(information)
         counts = torch.stack([views.sums[:, 0].log1p(), views.n_visible.float().log1p()], 1)
         of_pose = torch.stack([variances[:, :3].sum(1).log(), variances[:, 3:].sum(1).log()], 1).float()
         return torch.cat([counts, of_pose, views.cells.log1p()[:, None]], 1)
+
+
+def mapped_deviations(views: ViewSums, statistics: Tensor) -> Tensor:
+    """Return `MAPPED_DEVIATIONS` (B, 2) of views with `VIEW_STATISTICS` (B, S).
+
+    The covariance by `bearing_precision` is scaled by the ratio of both precisions, summed over the landmarks: for the
+    position over their squared distances. That is within 6 % of the exact deviation on maps of photographs.
+    """
+    sums = views.sums.double()
+    # of each landmark, the traces of its blocks are twice its precision, once over the squared distance
+    ratios = torch.stack(
+        [sums[:, [1, 4, 6]].sum(1) / (2 * sums[:, 16]), sums[:, [10, 13, 15]].sum(1) / (2 * sums[:, 17])], 1
+    )
+    columns = [VIEW_STATISTICS.index(name) for name in ("log_position_variance", "log_orientation_variance")]
+    unit = torch.tensor([-log(320), log(180 / torch.pi) - log(320)], device=sums.device).double()
+    # without any landmark, the prior alone is left
+    return (statistics[:, columns].double() + ratios.nan_to_num(nan=1.0).log()) / 2 + unit
 
 
 def expected_cells(

@@ -28,8 +28,16 @@ from wheretolook.mapping.colmap_model import observation_matrix, select_points
 from wheretolook.mapping.landmarks import MAP_ATTRIBUTES
 from wheretolook.mapping.map import Map
 from wheretolook.scorers.base import LandmarkProbabilities, Scorer
-from wheretolook.scorers.set.accuracy import AccuracyModel, probabilities, statistics_of
-from wheretolook.scorers.set.network import N_EXPECTED, SetNetwork, ViewSums, bearing_precision, expected_cells
+from wheretolook.scorers.set.accuracy import model_of, probabilities, statistics_of
+from wheretolook.scorers.set.network import (
+    N_EXPECTED,
+    SetNetwork,
+    ViewSums,
+    along,
+    bearing_precision,
+    expected_cells,
+    precision_of_track,
+)
 from wheretolook.training.trained_network import (
     RangeWatch,
     TrainedNetwork,
@@ -96,7 +104,8 @@ class BatchedDirections:
             self._first = first(matchability.input(values)) - means_of_image
             mapped = [MAP_ATTRIBUTES.index(name) for name in ("mapped_distance", "mapped_pixel_size")]
             mapped_from = torch.from_numpy(landmarks.mapping_direction[self.points.order]).to(self.device)
-            self._mapped = torch.cat([mapped_from, of_map[:, mapped]], 1)
+            track, spread = (of_map[:, [MAP_ATTRIBUTES.index(name)]] for name in ("track_length", "direction_spread"))
+            self._mapped = torch.cat([mapped_from, of_map[:, mapped], (-track).exp(), along(spread)], 1)
         with warnings.catch_warnings():  # PyTorch warns once that sparse matrices are new
             warnings.simplefilter("ignore")
             torch.sparse_csr_tensor([0, 0], [], [], size=(1, 1))
@@ -198,7 +207,7 @@ class BatchedDirections:
         return probabilities(self.trained, self.accuracy, ViewSums(sums * each[:, None], visible, cells))
 
     def _described(self, offsets: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the first layer (M, W) of landmarks without their position in the image, and their terms of sums (M, 16).
+        """Return the first layer (M, W) of landmarks without their position in the image, and their terms of sums.
 
         The landmarks are at offsets (M, 3) m from the location, and at rows (M,) of the points.
         """
@@ -213,14 +222,17 @@ class BatchedDirections:
         pixels = torch.stack([torch.full_like(size_ratio, self._pixel_angle), size_ratio], 1)
         weight = bearing_precision(pixels, ("pixel_angle", "pixel_size_ratio"))
         x, y, z = bearing.unbind(1)
-        terms = torch.empty((len(x), 16), device=self.device)
+        terms = torch.empty((len(x), N_EXPECTED), device=self.device)
         terms[:, 0] = 1
-        plane = terms[:, 10:]
+        plane = terms[:, 10:16]
         for column, number in enumerate((1 - x * x, -x * y, -x * z, 1 - y * y, -y * z, 1 - z * z)):
             torch.mul(number, weight, out=plane[:, column])
         inverse = distance.reciprocal()
         torch.mul(plane, inverse.square()[:, None], out=terms[:, 1:7])
         torch.mul(bearing, (inverse * weight)[:, None], out=terms[:, 7:10])
+        of_track, excess = mapped[:, 5:].unbind(1)
+        terms[:, 17] = precision_of_track(pixels[:, 0], size_ratio, angle, of_track, excess)
+        torch.mul(terms[:, 17], inverse.square(), out=terms[:, 16])
         return base, terms
 
 
@@ -295,7 +307,7 @@ OFFSETS = np.linspace(-1, 2, 61).tolist()
 def for_map(trained: TrainedNetwork[SetNetwork], localization_map: LocalizationMap) -> TrainedNetwork[SetNetwork]:
     """Return a network calibrated for a map of photographs; the same network for a map of renders.
 
-    The log-odds of detection get `detection_offset`, those of the view `TrainedNetwork.photograph_offset`.
+    The log-odds of detection get `detection_offset`, and errors the map's `error_scale`.
     """
     if not localization_map.map.has_photographs:
         return trained
@@ -304,7 +316,16 @@ def for_map(trained: TrainedNetwork[SetNetwork], localization_map: LocalizationM
     assert isinstance(last, torch.nn.Linear)
     with torch.no_grad():
         last.bias.add_(_known_offset(network, localization_map))
-    return replace(trained.for_photographs(), network=network)
+    return replace(trained, network=network, error_scale=error_scale(localization_map))
+
+
+def error_scale(localization_map: LocalizationMap) -> float:
+    """Return the scale of the errors of a map's poses: its keypoint noise in pixels.
+
+    At least a tenth of a pixel, less than that of SIFT: maps made from exact points have none.
+    """
+    whole = localization_map.map.whole or localization_map.map
+    return max(0.1, whole.landmarks.keypoint_noise_px)
 
 
 def _known_offset(network: SetNetwork, localization_map: LocalizationMap) -> float:
@@ -433,7 +454,7 @@ class SetScorer(LandmarkScorer):
             views = self.network.sums_of(described, visible)
             score[rows] = probabilities(self.trained, self.accuracy, views)
             expected_inliers[rows] = views.sums[:, 0].cpu().numpy()
-            errors[rows] = AccuracyModel.bundled().expected_errors(statistics_of(self.network, views))
+            errors[rows] = model_of(self.trained).expected_errors(statistics_of(self.trained, views))
             n_visible[rows] = visible.cpu().numpy()
             in_range[rows] &= self._in_range(described, visible)
             out_of_range[rows] = self.training_range.texts(view_quantities(described, visible, self._of_camera))

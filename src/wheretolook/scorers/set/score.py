@@ -324,13 +324,13 @@ def error_scale(localization_map: LocalizationMap) -> float:
     """Return the scale of the errors of a map's poses: its keypoint noise in pixels, times a factor by its tracks.
 
     The noise is at least a tenth of a pixel, less than that of SIFT: maps made from exact points have none. Of the log of
-    the factor, `log_error_ratio` over its mean of maps of photographs, 0.7 counts (docs/research/cameras.md).
+    the factor, `log_error_ratio` over its mean of maps of photographs, 0.4 counts (docs/research/cameras.md).
     """
     whole = localization_map.map.whole or localization_map.map
     if "error_scale" not in whole.computed:
         noise_px = max(0.1, whole.landmarks.keypoint_noise_px)
         ratio = None if whole.images is None else log_error_ratio(whole.images, whole.cameras, noise_px)
-        whole.computed["error_scale"] = noise_px * (1.0 if ratio is None else exp(0.7 * (ratio - 0.27)))
+        whole.computed["error_scale"] = noise_px * (1.0 if ratio is None else exp(0.4 * (ratio - 0.27)))
     return float(whole.computed["error_scale"])
 
 

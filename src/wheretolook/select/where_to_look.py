@@ -14,6 +14,10 @@ from numpy.typing import ArrayLike
 
 from wheretolook.dataset.config import ACCURACY, Accuracy
 from wheretolook.dataset.scene import ColmapFiles, Scene
+from wheretolook.extend.audit import Audit, audit_places, free_places
+from wheretolook.extend.config import TargetOptions, check_extension
+from wheretolook.extend.places import pitches_within, views_around, yaws_around
+from wheretolook.extend.plan import Extension, Planner
 from wheretolook.geometry.camera import Camera, PinholeCamera, parse_camera
 from wheretolook.geometry.lattices import Lattice, direction_lattice
 from wheretolook.geometry.poses import Float, camera_centers, rigid_poses
@@ -321,6 +325,67 @@ class WhereToLook:
     def select(self, waypoints: Waypoints, request: SelectionRequest, progress: bool = False) -> Views:
         """Select the requested views at waypoints; raises as `best`."""
         return select_views(self.scorer, self.reasons, self.directions, waypoints, request, progress)
+
+    def audit(
+        self, at: ArrayLike | Waypoints | None = None, heading_deg: ArrayLike | None = None, **options: Any
+    ) -> Audit:
+        """Score the views that a robot will have, at points (W, 3) of the map or in all free space.
+
+        Args:
+            at: locations of the camera; None for all free space at the heights of the camera.
+            heading_deg: yaws (W,) of the robot at the points, for a limit on pan.
+            options: fields of `wheretolook.extend.config.TargetOptions`.
+
+        Raises:
+            TableError: as `best`.
+            ConfigError: an option is out of range, the scores are no probabilities, or a height is given without a floor.
+            SceneError: there is no place where a camera can be.
+        """
+        check_names("option of audit", options, TargetOptions, ("at", "heading_deg"))
+        request = TargetOptions(**options)
+        if at is None:
+            places, apart_m = free_places(self.scorer, self.space, request, 300)
+            return audit_places(self.scorer, places, [*map(str, range(len(places)))], None, request, apart_m)
+        waypoints = Waypoints.of(at, (), heading_deg)
+        waypoints = waypoints[np.flatnonzero(usable_waypoints(self.localization_map, waypoints, request.skip))]
+        to_world = self.frame.world_from_map
+        heading = None if request.pan_deg is None else waypoints.heading_deg(to_world.rotation)
+        return audit_places(self.scorer, to_world.apply(waypoints.points), waypoints.ids, heading, request, 1.0)
+
+    def extend(
+        self,
+        n: int,
+        at: ArrayLike | Waypoints | None = None,
+        heading_deg: ArrayLike | None = None,
+        *,
+        until: float = 1.0,
+        least_p: float = 0.3,
+        **options: Any,
+    ) -> Extension:
+        """Plan the next photographs of the place, so that most views that a robot will have localize in the map.
+
+        They come in pairs, since a landmark needs two images; one of each pair registers in the map so far.
+
+        Args:
+            n: number of photographs.
+            at: where the robot's camera will be, as in `audit`; the photographs may be anywhere in free space.
+            heading_deg: yaws (W,) of the robot at the points, for a limit on pan.
+            until: share of the target views that localize at which the photographs end.
+            least_p: least probability that one of a pair registers.
+            options: fields of `wheretolook.extend.config.TargetOptions`.
+
+        Raises:
+            MapError: no photograph registers in the map.
+            TableError, ConfigError, SceneError: as `audit`; n is below 1, or a share is none.
+        """
+        check_extension(n, until, least_p)
+        audit = self.audit(at, heading_deg, **options)
+        request = TargetOptions(**options)
+        yaws = yaws_around(self.localization_map.camera)
+        pitches = pitches_within(request.pitch_deg)
+        places, _ = free_places(self.scorer, self.space, request, 2400 // (yaws * len(pitches)))
+        candidates, _ = views_around(places, yaws, pitches)
+        return Planner(self.scorer, self.space, audit.views, candidates).plan(n, least_p, until, request.seed)
 
     def floor_plan(self, views: Views) -> Figure:
         """Draw views on a plan of the landmarks, in the map's unit, upright: a Matplotlib figure."""

@@ -66,7 +66,8 @@ def planner_of(scorer, space):
     centers = camera_centers(scorer.localization_map.mapping_poses)
     places, _ = camera_places(space, centers, None, 60)
     poses, rows = drawn_views(places, 100, np.zeros(1), None, (-180, 180), 0)
-    targets = Views(poses, CAMERA, "set", waypoint=rows, score=scorer.score(poses))
+    frame = scorer.localization_map.frame
+    targets = Views(poses, CAMERA, "set", frame, waypoint=rows, score=scorer.score(poses))
     return Planner(scorer, space, targets, views_around(places, 8, np.zeros(1))[0])
 
 
@@ -188,15 +189,15 @@ def look(room):
 
 def test_an_audit_has_the_mean_score_of_the_views_and_their_weak_regions(look):
     audit = look.audit(views=60)
-    assert audit.share == pytest.approx(look.score(audit.views.in_frame(look.frame).cam_from_world).mean(), rel=1e-5)
+    assert audit.share == pytest.approx(look.score(audit.views.cam_from_world).mean(), rel=1e-5)
     low, high = audit.interval
     assert low <= audit.share <= high
-    places = audit.of_places()
+    places = audit.places()
     assert places["n_views"].sum() == len(audit.views)
     weak = places["share"] < 0.5
     np.testing.assert_array_equal(places["region"] > 0, weak)
     assert (places.loc[weak, "cause"] != "").all()
-    assert audit.on(look.scorer).share == pytest.approx(audit.share)
+    assert look.audit(audit).share == pytest.approx(audit.share)
 
 
 @pytest.mark.parametrize(

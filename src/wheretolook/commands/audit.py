@@ -76,7 +76,7 @@ class AuditMap(TargetOptions, OpenOptions):
         options = {name: getattr(self, name) for name in TargetOptions.__dataclass_fields__}
         look = next(iter(looks.values()))
         audit = look.audit(at, **options)
-        audits = {name: audit if other is look else audit.on(other.scorer) for name, other in looks.items()}
+        audits = {name: audit if other is look else other.audit(audit) for name, other in looks.items()}
         mounts = compare_mounts(lambda **mount: look.audit(at, **{**options, **mount}), self)
         save_audits(audits, mounts, look.localization_map.landmarks.points, self.out)
         print(look.frame.describe())

@@ -65,7 +65,7 @@ class Extend(TargetOptions, SelectorOptions):
 
     def run(self) -> Extension:
         """Plan the photographs, write them to `out` and print a summary."""
-        from wheretolook.extend.report import heat_maps, places_and_shares
+        from wheretolook.extend.report import heat_maps
         from wheretolook.figures.floor_plan import save_figure
 
         start = time.monotonic()
@@ -77,14 +77,12 @@ class Extend(TargetOptions, SelectorOptions):
         before = float(plan.targets.score.mean())
         after = float(plan.predicted.mean())
         if self.floor_plan is not None:
-            shares = {
-                f"now: {100 * before:.0f} %": plan.targets.score,
-                f"predicted: {100 * after:.0f} %": plan.predicted,
+            maps = {
+                f"now: {100 * before:.0f} %": (plan.targets, plan.targets.score),
+                f"predicted: {100 * after:.0f} %": (plan.targets, plan.predicted),
             }
-            maps = [(title, *places_and_shares(plan.targets, values)) for title, values in shares.items()]
-            save_figure(
-                heat_maps(look.localization_map.landmarks.points, maps, look.frame, plan.views), self.floor_plan
-            )
+            points = look.localization_map.landmarks.points
+            save_figure(heat_maps(points, maps, look.frame, plan.views), self.floor_plan)
             print(f"floor plan: {self.floor_plan}")
         print(look.frame.describe())
         for doubt in look.frame.doubts:

@@ -10,9 +10,11 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from wheretolook.extend.surface import mapping_views
 from wheretolook.geometry.camera import Camera, field_of_view_deg
 from wheretolook.geometry.lattices import axes_of_angles
-from wheretolook.geometry.poses import Float, poses_looking_along
+from wheretolook.geometry.poses import Float, camera_centers, poses_looking_along
+from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.space.free_space import FreeSpace
 from wheretolook.utils.errors import ConfigError, SceneError
 
@@ -43,7 +45,7 @@ def camera_places(space: Any, cameras: Float, height_m: float | None, most: int)
         places = places[space.is_free(places)]
     if len(places) == 0:
         value = f"height {height_m:g} m" if height_m is not None else f"{len(ground)} places tried"
-        fix = "Check --height, --mesh-up and the scale, or give places with --at."
+        fix = "Check --height, --mesh-up and the scale."
         raise SceneError("there is no place where a camera can be", value=value, fix=fix)
     apart = max(0.5, step * float(np.sqrt(len(places) / most)))
     cell = np.floor(places / (apart, apart, 1.0)).astype(np.int64)
@@ -81,6 +83,15 @@ def pitches_within(pitch_deg: tuple[float, float]) -> Float:
     """Return pitches from the lowest to the highest, at most 20 degrees apart."""
     low, high = pitch_deg
     return np.linspace(low, high, int(np.ceil((high - low) / 20 - 1e-9)) + 1)
+
+
+def free_places(
+    localization_map: LocalizationMap, space: Any, heights_m: tuple[float, ...], most: int
+) -> tuple[Float, float]:
+    """Return the places of all heights, as `camera_places`, and how far they are apart."""
+    centers = camera_centers(mapping_views(localization_map)[0])
+    found = [camera_places(space, centers, height, most) for height in heights_m or (None,)]
+    return np.concatenate([places for places, _ in found]), max(apart for _, apart in found)
 
 
 def yaws_around(camera: Camera) -> int:

@@ -28,7 +28,7 @@ class Extension:
 
     Attributes:
         views: the photographs, in the map's own frame, with the columns that `Views` has for them.
-        targets: the target views, in the world; `score` is on the present map.
+        targets: the target views, in the map's own frame; `score` is on the present map.
         predicted: (T,) probability that each localizes with all of the photographs.
         surface: what the surface of the place is known from: mesh, depth images or landmarks.
         correlation: between the score of target views and what is predicted from the surface that the map covers.
@@ -58,7 +58,9 @@ def fit_coverage(coverage: Float, scores: Float) -> tuple[float, float]:
 
 
 class Planner:
-    """Gains of candidate photographs (C, 3, 4) for target views, a `Views` in the world with scores and places.
+    """Gains of candidate photographs (C, 3, 4) for target views with scores and places, in the map's own frame.
+
+    Candidates are in the world.
 
     Everything is counted in patches of surface: one is mapped if at least two images cover it, see `Surface.covering`.
     """
@@ -71,7 +73,8 @@ class Planner:
         self.candidates = candidates[~self._taken(candidates)]
         n = len(self.candidates)
         self.camera = scorer.localization_map.camera
-        self.patches = self.surface.patches(targets.cam_from_world, 10, 8)
+        to_world = scorer.localization_map.frame.world_from_map
+        self.patches = self.surface.patches(to_world.apply_to_poses(targets.cam_from_world), 10, 8)
         covers = self.surface.covering(self.patches, self.candidates, [self.camera] * n)
         self.covers = vstack([covers, csr_array((1, covers.shape[1]))], format="csr")  # -1: no photograph
         present = self.surface.covering(self.patches, self.images, self.cameras)

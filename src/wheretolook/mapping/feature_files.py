@@ -89,11 +89,13 @@ def features_kind(features: Path, reconstruction: Any) -> DescriptorKind | None:
     return kind
 
 
-def read_features(features: str | Path, names: Sequence[str]) -> tuple[DescriptorKind, list[Stored]]:
+def read_features(
+    features: str | Path, names: Sequence[str], reconstruction: Any = None
+) -> tuple[DescriptorKind, list[Stored]]:
     """Read keypoints and descriptors of images by their names, from a file of features as `read_descriptors` does.
 
-    Raises MapError if the file is missing or unreadable, lacks an image, or one of them has no descriptors of a known
-    kind.
+    Raises MapError if the file is missing or unreadable, lacks an image, one of them has no descriptors of a known kind,
+    or other keypoints than in a reconstruction.
     """
     path = Path(features)
     images = [*_read_images(path, names)]
@@ -103,6 +105,9 @@ def read_features(features: str | Path, names: Sequence[str]) -> tuple[Descripto
         if image.descriptors is None and len(image.keypoints):
             problem = f"this image has no descriptors of {', '.join(KINDS)} in this file"
             raise MapError(problem, path=path, value=name, fix="hloc keeps them in HDF5: --database feats-*.h5.")
+        in_model = None if reconstruction is None else reconstruction.find_image_with_name(name)
+        if in_model is not None and in_model.num_points2D():  # hloc's have none in images that observe nothing
+            _check_keypoints(image, in_model, path)
         descriptors = kind.none() if image.descriptors is None else image.descriptors
         stored.append((image.keypoints.astype(np.float32), descriptors))
     return kind, stored

@@ -18,9 +18,7 @@ from jsonargparse import auto_cli
 from numpy.typing import NDArray
 
 from wheretolook.dataset.scene import ColmapFiles, Scene
-from wheretolook.extend.audit import free_places
-from wheretolook.extend.config import TargetOptions
-from wheretolook.extend.places import camera_places, drawn_views, views_around, yaws_around
+from wheretolook.extend.places import camera_places, drawn_views, free_places, views_around, yaws_around
 from wheretolook.extend.plan import Planner
 from wheretolook.features.extractor import ExtractorConfig
 from wheretolook.geometry.camera import PinholeCamera
@@ -154,7 +152,7 @@ def main(
     tests, _ = drawn_views(places, len(places), np.zeros(1), None, (-180, 180), 1000 + seed)
     tests = tests[np.random.default_rng(seed).permutation(len(tests))[:views]]
     audit = look.audit()
-    own, _ = free_places(look.scorer, look.space, TargetOptions(), 300)
+    own, _ = free_places(look.localization_map, look.space, (), 300)
     yaws = yaws_around(scene.camera)
     good: dict[str, NDArray[np.bool_]] = {}
     records = []

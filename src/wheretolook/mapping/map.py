@@ -335,6 +335,7 @@ class Map:
             observation_start=np.concatenate([[0], np.cumsum(counts)]),
             observation_image=images.observation_image[observations],
             observation_keypoint=images.observation_keypoint[observations],
+            observation_pixels=None,
         )
         return landmarks_of(self.landmarks, select_points(left, counts >= 2))
 

@@ -43,6 +43,8 @@ COMMANDS = {
     "score": "wheretolook.commands.select:Score",
     "localize": "wheretolook.commands.localize:Localize",
     "check": "wheretolook.commands.check:Check",
+    "audit": "wheretolook.commands.audit:AuditMap",
+    "extend": "wheretolook.commands.extend:Extend",
     "view": "wheretolook.commands.view:View",
     "export": "wheretolook.commands.export:Export",
 }

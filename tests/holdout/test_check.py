@@ -232,20 +232,24 @@ def test_another_accuracy_judges_the_same_poses(checked, corridor, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("auc", "ece", "in_range", "expected"),
+    ("auc", "ece", "ratio", "in_range", "expected"),
     [
-        (0.95, 0.03, 1.0, "trust the scores"),
-        (0.95, 0.15, 1.0, "trust the order"),
-        (0.95, None, 1.0, "trust the order"),  # of a rule that predicts no probabilities
-        (0.60, 0.03, 1.0, "do not use"),
-        (0.95, 0.03, 0.3, "do not use"),
-        (None, None, 1.0, "unknown"),
+        (0.95, 0.03, 1.1, 1.0, "trust the scores"),
+        (0.95, 0.09, 1.1, 1.0, "trust the scores"),  # as exact probabilities of as many views may have
+        (0.95, 0.15, 1.1, 1.0, "trust the order"),
+        (0.95, 0.03, 6.3, 1.0, "trust the order"),
+        (0.95, None, 1.1, 1.0, "trust the order"),  # of a rule that predicts no probabilities
+        (0.60, 0.03, 1.1, 1.0, "do not use"),
+        (0.95, 0.03, 1.1, 0.3, "do not use"),
+        (None, None, 1.1, 1.0, "unknown"),
     ],
 )
-def test_the_advice_follows_from_order_values_and_range(auc, ece, in_range, expected):
+def test_the_advice_follows_from_order_values_and_range(auc, ece, ratio, in_range, expected):
     numbers = {
         "methods": {"set": {"auc": {"value": auc}}},
         "ece": None if ece is None else {"value": ece},
+        "ece_if_calibrated": 0.1,
+        "errors_at_right_place": {"m": {"ratio": {"value": ratio}}},
         "share_in_range": in_range,
     }
     none = None

@@ -3,11 +3,13 @@
 import numpy as np
 import pandas as pd
 import pytest
+from scipy.stats import gmean
 from sklearn.metrics import roc_auc_score
 
 from wheretolook.evaluation.statistics import ClusterBootstrap, expected_calibration_error
 from wheretolook.holdout.metrics import (
     RESAMPLES,
+    error_of_calibrated,
     measure,
     places_of,
     regret_of_places,
@@ -25,7 +27,9 @@ def views():
     return pd.DataFrame(
         {
             "score": score, "good": good, "visible": visible, "block": rng.integers(1, 9, 300), "in_range": True,
-            "n_inliers": rng.integers(0, 50, 300), "expected_inliers": rng.uniform(5, 50, 300),
+            "n_inliers": rng.integers(0, 50, 300), "expected_inliers": rng.uniform(5, 50, 300), "right_place": good,
+            **{f"error_{unit}": np.where(good, rng.lognormal(-4, 1, 300), np.nan) for unit in ("m", "deg")},
+            **{f"expected_error_{unit}": rng.lognormal(-4, 0.5, 300) for unit in ("m", "deg")},
         }
     )  # fmt: skip
 
@@ -85,6 +89,29 @@ def test_measure_compares_methods(views):
     assert ratio["all"]["value"] == pytest.approx(inliers.sum() / expected.sum())
     assert ratio["localized"]["value"] == pytest.approx(inliers.sum() / expected[good].sum())
     assert 0 < mine["regret"]["value"] < other["regret"]["value"] and numbers["n_places_of_both_kinds"] > 10
+
+
+def test_errors_are_compared_at_the_right_place_alone(views):
+    columns = {"set": "score", "visible": "visible"}
+    found = measure(views, columns, np.zeros((300, 3)), 0.5, True)["errors_at_right_place"]["m"]
+    right = views[views["good"]]
+    ratios = right["error_m"] / right["expected_error_m"]
+    assert found["n"] == len(right) and found["observed_90%"] == pytest.approx(right["error_m"].quantile(0.9))
+    assert found["expected_50%"] == pytest.approx(right["expected_error_m"].median())
+    assert found["ratio"]["value"] == pytest.approx(gmean(ratios))
+    assert found["ratio"]["low"] < gmean(ratios) < found["ratio"]["high"]
+    unknown = views.assign(expected_error_m=np.nan)  # of methods that predict no errors
+    assert measure(unknown, columns, np.zeros((300, 3)), 0.5, True)["errors_at_right_place"] is None
+
+
+def test_exact_probabilities_exceed_their_own_calibration_error_once_in_twenty():
+    rng = np.random.default_rng(5)
+    exceeded = []
+    for _ in range(200):
+        probability = rng.random(60)
+        error = expected_calibration_error(probability, rng.random(60) < probability)
+        exceeded.append(error > error_of_calibrated(probability))
+    assert 0.02 <= np.mean(exceeded) <= 0.09
 
 
 def test_where_all_localize_there_is_no_auc(views):

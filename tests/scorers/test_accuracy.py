@@ -97,8 +97,8 @@ def test_on_photographs_it_is_the_product_of_both_factors_by_the_deviation_of_th
     statistics = views()
     statistics[:, -2:] = np.random.default_rng(3).normal(-4, 1, (len(statistics), 2))
     own = np.random.default_rng(4).uniform(0.01, 0.99, len(statistics))
-    model = PhotographModel((0.8, 0.2), 0.1, (LogError((), 0.9, 1.1), LogError((), 0.7, 1.0)))
-    odds = (own / (1 - own)) ** 0.8 * np.exp(0.2 * statistics[:, STATISTICS.index("log_orientation_variance")] + 0.1)
+    model = PhotographModel((0.8,), 0.1, (LogError((), 0.9, 1.1), LogError((), 0.7, 1.0)))
+    odds = (own / (1 - own)) ** 0.8 * np.exp(0.1)
     median_m, median_deg = np.exp(statistics[:, -2:] + (0.9, 0.7)).T
     for metres, degrees in ACCURACIES:
         within = lognorm(1.1, scale=median_m).cdf(metres), lognorm(1.0, scale=median_deg).cdf(degrees)

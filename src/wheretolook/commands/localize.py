@@ -64,8 +64,8 @@ class Localize(CameraOptions, FrameOptions):
         prior: rough x,y,z of the camera in the map, and perhaps its yaw in degrees: one more hypothesis.
         accuracy: limits of the errors in metres and degrees that the probability refers to.
         next: also print where a camera that turns in place should look next, by the bundled weights.
-        pitch: lowest and highest pitch in degrees of the next view.
-        pan: its lowest and highest pan in degrees, to the left from the first view; by default any.
+        pitch_deg: lowest and highest pitch in degrees of the next view.
+        pan_deg: its lowest and highest pan in degrees, to the left from the first view; by default any.
         database: COLMAP's database.db or hloc's feats-*.h5.
         extractor: extractor for the images, as --mapping.extractor.method of `wheretolook map`.
         extractor_weights: weights of a learned extractor; see docs/features.md.
@@ -77,6 +77,7 @@ class Localize(CameraOptions, FrameOptions):
     """
 
     POSITIONAL: ClassVar = "images"
+    SHORT: ClassVar = {"pitch": "pitch_deg", "pan": "pan_deg"}
 
     map: Path
     images: tuple[Path, ...]
@@ -86,8 +87,8 @@ class Localize(CameraOptions, FrameOptions):
     prior: tuple[float, ...] | None = None
     accuracy: tuple[float, float] = (0.05, 0.4)
     next: bool = False
-    pitch: tuple[float, float] = (-45.0, 45.0)
-    pan: tuple[float, float] | None = None
+    pitch_deg: tuple[float, float] = (-45.0, 45.0)
+    pan_deg: tuple[float, float] | None = None
     database: Path | None = None
     extractor: str | None = None
     extractor_weights: str = ""
@@ -194,7 +195,7 @@ class Localize(CameraOptions, FrameOptions):
         frame = vars(self.frame_options())
         camera = result.cameras[0]
         look = WhereToLook.from_colmap(self.map, camera=camera, database=self.database, device=device, **frame)
-        chosen = look.next_look(result, self.pitch, self.pan)
+        chosen = look.next_look(result, self.pitch_deg, self.pan_deg)
         side = "left" if chosen.pan_deg > 0 else "right"
         turn = f"turn {abs(chosen.pan_deg):.0f} degrees to the {side}, to a pitch of {chosen.pitch_deg:.0f} degrees"
         print(f"next view: {turn}; it localizes with an expected probability of {chosen.gain:.2f}")

@@ -17,7 +17,7 @@ from wheretolook.geometry.pose_files import poses_of_rows, read_named_rows
 from wheretolook.geometry.views import Views, check_format
 from wheretolook.mapping.colmap_model import model_suffix
 from wheretolook.mapping.config import FrameOptions
-from wheretolook.select.waypoints import SelectionRequest, parse_points, read_waypoints
+from wheretolook.select.waypoints import SelectionRequest, given_waypoints
 from wheretolook.utils.devices import usable_device
 from wheretolook.utils.errors import ConfigError, MapWarning, check_choice
 
@@ -29,14 +29,11 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
-class SelectorOptions(CameraOptions, ScorerOptions, FrameOptions):
+class OpenOptions(CameraOptions, ScorerOptions, FrameOptions):
     """A COLMAP model, and how its views are scored.
 
     Args:
         map: folder of a COLMAP model, binary or text.
-        out: file of the views; its ending decides the format.
-        format: csv, json, tum, colmap or benchmark.
-        floor_plan: also draw the views on a plan of the landmarks: a file .png, .pdf or .svg.
         fov: instead of a camera, horizontal field of view of a pinhole in degrees.
         size: image size of that pinhole in pixels, such as 640x480.
         depth: folder of depth images, named like the map's images.
@@ -45,15 +42,9 @@ class SelectorOptions(CameraOptions, ScorerOptions, FrameOptions):
             hloc's near the model, or a database near it; of SIFT only for up to 30,000 points.
         max_error: leave out landmarks with a larger mean reprojection error, in pixels.
         device: where to compute: auto, cpu, cuda, or cuda:<index>.
-        frame: whose orientations a trajectory or table holds: base (x forward, z up) or camera (z forward). By default
-            that of a base if all its z axes are within 45 degrees of up.
     """
 
     map: Path
-    out: Path
-    format: str | None = None
-    frame: Literal["base", "camera"] | None = None
-    floor_plan: Path | None = None
     fov: float | None = None
     size: str | None = None
     depth: Path | None = None
@@ -67,8 +58,6 @@ class SelectorOptions(CameraOptions, ScorerOptions, FrameOptions):
         if self.accuracy is not None:
             checked_accuracy(self.accuracy)
         self.named_camera()
-        if self.floor_plan is not None:
-            check_choice("format of figures", self.floor_plan.suffix[1:].lower(), KINDS)
 
     def named_camera(self) -> Camera | int | None:
         """Return the camera asked for: one, a camera_id of the map, or None for the map's own."""
@@ -81,19 +70,20 @@ class SelectorOptions(CameraOptions, ScorerOptions, FrameOptions):
             raise ConfigError("the camera is described in several ways", value=self.fov, fix="Give one of them.")
         return PinholeCamera.of_field_of_view(self.fov, *parse_size(self.size or "640x480"))
 
-    def open_map(self, **options: Any) -> WhereToLook:
-        """Open the map; `options` are further ones of `WhereToLook.from_colmap`."""
+    def open_map(self, path: Path | None = None, **options: Any) -> WhereToLook:
+        """Open the map, or that of another path; `options` are further ones of `WhereToLook.from_colmap`."""
         from wheretolook.utils.warp import start_warp
         from wheretolook.visibility.counting import compile_kernels
 
-        model_suffix(self.map)
+        path = path or self.map
+        model_suffix(path)
         device = usable_device(self.device)
         with ThreadPoolExecutor(1) as executor:  # kernels compile, if they must, during imports and reading
             compiled = executor.submit(compile_kernels, start_warp(device))
             from wheretolook.select.where_to_look import WhereToLook
 
             selector = WhereToLook.from_colmap(
-                self.map,
+                path,
                 weights=self.weights,
                 method=self.method,
                 mesh=self.mesh,
@@ -109,6 +99,29 @@ class SelectorOptions(CameraOptions, ScorerOptions, FrameOptions):
             )
             compiled.result()
         return selector if self.accuracy is None else selector.at_accuracy(self.accuracy)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SelectorOptions(OpenOptions):
+    """A COLMAP model, and the views that are written.
+
+    Args:
+        out: file of the views; its ending decides the format.
+        format: csv, json, tum, colmap or benchmark.
+        floor_plan: also draw the views on a plan of the landmarks: a file .png, .pdf or .svg.
+        frame: whose orientations a trajectory or table holds: base (x forward, z up) or camera (z forward). By default
+            that of a base if all its z axes are within 45 degrees of up.
+    """
+
+    out: Path
+    format: str | None = None
+    frame: Literal["base", "camera"] | None = None
+    floor_plan: Path | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.floor_plan is not None:
+            check_choice("format of figures", self.floor_plan.suffix[1:].lower(), KINDS)
 
 
 def finish(command: SelectorOptions, selector: WhereToLook, views: Views, given: int, locations: str) -> None:
@@ -226,9 +239,7 @@ class Select(SelectionRequest, SelectorOptions):
 
     def _waypoints(self) -> Waypoints | None:
         """Return the waypoints, None for a grid."""
-        if len(self.at) == 1 and (Path(self.at[0].strip()).exists() or self.at[0].count(",") != 2):
-            return read_waypoints(self.at[0].strip(), self.frame)
-        return parse_points(self.at) if self.at else None
+        return given_waypoints(self.at, self.frame) if self.at else None
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -54,6 +54,13 @@ WRITTEN = {
     "in_range": "",
     "out_of_range": "",
     "camera_id": "",
+    "gain": ".4f",
+    "share": ".4f",
+    "share_low": ".4f",
+    "share_high": ".4f",
+    "p_registers": ".4f",
+    "partner": "",
+    "overlaps": "",
 }
 """Columns that tables of views have in this order, if they are known, and how their floats are written."""
 
@@ -99,6 +106,15 @@ class Views:
     n_too_far: Column = None
     n_too_oblique: Column = None
     n_repeated: Column = None
+    # (V,) of photographs to add to a map: gain in the predicted share of target views that localize, that share after
+    # it with its 95 % interval, probability that it registers; names of its partner and of the images it overlaps with
+    gain: Column = None
+    share: Column = None
+    share_low: Column = None
+    share_high: Column = None
+    p_registers: Column = None
+    partner: Column = None
+    overlaps: Column = None
     # (V,) of labelled views: number of the scene, ids of location and viewpoint, and block of neighbouring locations
     scene: Column = None
     location_id: Column = None

@@ -24,6 +24,7 @@ from wheretolook.features.extractor import Keypoints
 from wheretolook.geometry.lattices import spread_rows
 from wheretolook.geometry.poses import Float, camera_centers
 from wheretolook.holdout.photo_map import MAX_ERROR_DEG, MAX_ERROR_M, PhotographedMap
+from wheretolook.localization.confidence import RIGHT_PLACE_LIMITS
 from wheretolook.localization.config import LocalizerConfig, versions
 from wheretolook.localization.localizer import Localizer, localization_errors
 from wheretolook.mapping.colmap_model import observation_matrix, read_model, write_model
@@ -270,11 +271,19 @@ def hold_out_blocks(
 
 
 def judged(result: HoldoutResult, accuracy: Accuracy) -> HoldoutResult:
-    """Return a result whose views are good within another accuracy; where metres are unknown, limits stay shares of depth."""
+    """Return a result whose views are good within another accuracy, and at the right place within 0.5 m and 5 degrees.
+
+    Where metres are unknown, limits stay shares of depth.
+    """
     views = result.views
+
+    def within(metres: float, degrees: float) -> pd.Series:
+        near = views["error_m"] < views["limit_m"] * (metres / MAX_ERROR_M)
+        return (views["status"] == LOCALIZED) & near & (views["error_deg"] < degrees)
+
     limit_m = views["limit_m"] * (accuracy[0] / MAX_ERROR_M)
-    good = (views["status"] == LOCALIZED) & (views["error_m"] < limit_m) & (views["error_deg"] < accuracy[1])
-    return replace(result, views=views.assign(good=good, limit_m=limit_m))
+    right_place = within(*RIGHT_PLACE_LIMITS)
+    return replace(result, views=views.assign(good=within(*accuracy), right_place=right_place, limit_m=limit_m))
 
 
 def without(model: Any, image_ids: Sequence[int]) -> Any:

@@ -51,6 +51,17 @@ def resampled_calibration_error(bootstrap: ClusterBootstrap, probability: Float,
     return divide(np.abs(bootstrap.times @ bootstrap.sums(gaps)).sum(1), n_views)
 
 
+def error_of_calibrated(probability: Float, n_draws: int = 200) -> float:
+    """Return the 95 % quantile of the calibration error of probabilities (B,) if they were exact.
+
+    Views are few, so it is not 0 (Bröcker and Smith, Increasing the Reliability of Reliability Diagrams, 2007).
+    """
+    drawn = np.random.default_rng(0).random((n_draws, len(probability))) < probability
+    bins = bins_of(probability)
+    errors = [np.abs(np.bincount(bins, probability - good)).sum() / len(good) for good in drawn]
+    return float(np.quantile(errors, 0.95))
+
+
 def places_of(centers: Float, blocks: NDArray[np.integer], radius: float) -> NDArray[np.int64]:
     """Group views of the same block into places (B,), numbered from 0, whose cameras (B, 3) are within a radius.
 
@@ -117,6 +128,8 @@ def measure(
             "regret": record(bootstrap.ratios(100 * missed, has_choice), most=100),
             "rank_correlation_with_inliers": _correlation(score, n_inliers),
         }
+    right = views["right_place"].to_numpy(bool) & np.isfinite(views["expected_error_m"].to_numpy(np.float64))
+    errors = {name: _compared(bootstrap, views, right, name) for name in ("m", "deg")} if right.any() else None
     sizes = np.bincount(place)
     n_good = np.bincount(place, weights=good)
     probability = views["score"].to_numpy()
@@ -135,11 +148,27 @@ def measure(
         "n_places_of_both_kinds": int(((n_good > 0) & (n_good < sizes)).sum()),
         "methods": of_methods,
         "ece": record(resampled_calibration_error(bootstrap, probability, good)) if is_probability else None,
+        "ece_if_calibrated": error_of_calibrated(probability) if is_probability else None,
+        "errors_at_right_place": errors,
         "mean_probability": float(probability.mean()) if is_probability else None,
         "share_localized": float(good.mean()),
         "inliers_found_over_expected": ratios,
         "share_in_range": float(views["in_range"].mean()),
     }
+
+
+def _compared(
+    bootstrap: ClusterBootstrap, views: pd.DataFrame, right: NDArray[np.bool_], unit: str
+) -> dict[str, object]:
+    """Compare observed errors of views at the right place (B,) with expected ones: medians, 90 % quantiles, mean ratio."""
+    named = {"observed": views[f"error_{unit}"], "expected": views[f"expected_error_{unit}"]}
+    quantiles = {
+        f"{name}_{q:.0%}": float(errors[right].quantile(q)) for name, errors in named.items() for q in (0.5, 0.9)
+    }
+    logs = np.zeros(len(views))
+    logs[right] = np.log(np.maximum(named["observed"][right], 1e-12) / named["expected"][right])
+    ratios = np.exp(bootstrap.ratios(logs, right.astype(np.float64)))
+    return {"n": int(right.sum()), **quantiles, "ratio": _record(bootstrap, ratios, most=np.inf)}
 
 
 def _record(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -183,7 +183,10 @@ class CheckReport:
             return "whether to trust the order of the scores is unknown"
         if auc["value"] < 0.7:
             return "do not use these scores: they hardly order the views of this map"
-        if numbers["ece"] and numbers["ece"]["value"] > 0.08:  # of rendered scenes about 0.03
+        errors = numbers["errors_at_right_place"]
+        # of rendered scenes about 0.03, and errors are within a factor of 1.7 of the expected ones
+        wrong = numbers["ece"] and numbers["ece"]["value"] > max(0.08, numbers["ece_if_calibrated"])
+        if wrong or (errors and not 0.6 <= errors["m"]["ratio"]["value"] <= 1.7):
             return "trust the order of the scores, not their values: `wheretolook adapt` corrects these on this map"
         return "trust the scores" if numbers["ece"] else "trust the order of the scores"
 
@@ -215,11 +218,20 @@ class CheckReport:
         if numbers["ece"]:
             lines.append(
                 f"calibration error: {_with_interval(numbers['ece'], 3)}; {100 * numbers['mean_probability']:.0f} % "
-                f"predicted, {100 * numbers['share_localized']:.0f} % localize"
+                f"predicted, {100 * numbers['share_localized']:.0f} % localize; exact probabilities of as many views have "
+                f"up to {numbers['ece_if_calibrated']:.3f}"
             )
+        if errors := numbers["errors_at_right_place"]:
+            lines.append(self._errors_line(errors))
         if ratios := numbers["inliers_found_over_expected"]:
             good, every = (_with_interval(ratios[name], 2) for name in ("localized", "all"))
             lines.append(f"inliers over expected: {good} of views that localize, {every} of all")
+        if of_map := numbers.get("map"):
+            noise_px, scale, offset = of_map.values()
+            lines.append(
+                f"keypoint noise of the map {noise_px:.2f} px, errors as of {scale:.2f} px; log-odds of detection "
+                f"{offset or 0:+.2f}"
+            )
         if source.fov_deg is not None:
             lines.append(f"views of {source.fov_deg:g} degrees, {source.n_crops} of each photograph")
         if numbers["share_in_range"] < 1:
@@ -236,6 +248,20 @@ class CheckReport:
         if self.parts != printed:
             lines.append(f"  and {len(self.parts) - len(printed)} more: column part of check.csv")
         return lines
+
+    def _errors_line(self, errors: Mapping[str, Any]) -> str:
+        """State observed and expected errors: in centimetres, or as a share of the median depth."""
+        of_position = errors["m"]
+        unit, factor = ("cm", 100) if self.source.is_metric else ("% of depth", 100 / DEPTH_M)
+        medians, highest = (
+            f"{factor * of_position[f'observed_{q}']:.2g} {unit}, {factor * of_position[f'expected_{q}']:.2g} expected"
+            for q in ("50%", "90%")
+        )
+        return (
+            f"position errors of the {of_position['n']} views at the right place: median {medians}; 90 % below {highest}; "
+            f"observed over expected {_with_interval(of_position['ratio'], 2)}, of orientations "
+            f"{_with_interval(errors['deg']['ratio'], 2)}"
+        )
 
 
 def check_map(
@@ -261,6 +287,14 @@ def check_map(
     columns[VISIBLE] = columns.pop(VISIBLE)  # the baseline comes last
     centers = (source.own_centers * source.from_model.scale)[scored["row"].to_numpy()]
     numbers = measure(scored, columns, centers, source.place_radius, is_probability(method))
+    known = source.map.computed if source.photographs else {}
+    if "error_scale" in known:
+        offsets = [value for key, value in known.items() if isinstance(key, tuple)]
+        numbers["map"] = {
+            "keypoint_noise_px": source.map.landmarks.keypoint_noise_px,
+            "error_scale": known["error_scale"],
+            "detection_offset": offsets[0] if offsets else None,
+        }
     middle = scored[scored["crop"] == 0]
     parts = weak_parts(source, results, middle)
     photographs = _photographs(source, middle, parts)

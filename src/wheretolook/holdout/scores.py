@@ -99,7 +99,7 @@ def score_views(
 ) -> tuple[str, pd.DataFrame]:
     """Score the views of all blocks; returns the name of the checked method, and the views with further columns.
 
-    They are score, expected_inliers (NaN where the method has none), n_visible, in_range, `visible` (n_visible again),
+    They are score, expected_inliers and expected errors (NaN where the method has none), n_visible, in_range, `visible` (n_visible again),
     one for each further method, block and is_part. Scores that are shares of the map's landmarks are multiplied by
     their number, as blocks have maps of different sizes.
     """
@@ -146,9 +146,12 @@ def _score(
     with warnings.catch_warnings(action="ignore", category=OutOfRangeWarning):  # the column in_range reports them
         scorer = scoring.scorer(localization_map, anywhere=True)  # `check_place` has been called
         report = scorer.report(poses)
+        unknown = np.full(len(poses), np.nan)
         columns: dict[str, NDArray[np.generic]] = {
             "score": report.score * score_scale(scorer.name, localization_map),
             "expected_inliers": report.expected_inliers,
+            "expected_error_m": unknown if report.expected_error_m is None else report.expected_error_m,
+            "expected_error_deg": unknown if report.expected_error_deg is None else report.expected_error_deg,
             "n_visible": np.asarray(report.n_visible, dtype=np.int64),
             "in_range": report.in_range,
             VISIBLE: np.asarray(report.n_visible, dtype=np.float64),

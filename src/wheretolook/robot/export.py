@@ -276,6 +276,7 @@ def _description(trained: TrainedNetwork[SetNetwork], camera: PinholeCamera, acc
         "map_attributes": list(MAP_ATTRIBUTES),
         "most": MAX_LANDMARKS,
         "accuracy": list(accuracy),
+        "error_scale": trained.error_scale,
         "range": training_range.record(),
         "serves_camera": bool(training_range.contains(camera_quantities(camera)[None])[0]),
     }

@@ -128,6 +128,13 @@ def read_waypoints(path: str | Path, frame: str | None = None) -> Waypoints:
     return Waypoints(points, table.names, lines, table.path, known, table.format, of_base)
 
 
+def given_waypoints(texts: Sequence[str], frame: str | None = None) -> Waypoints:
+    """Return the waypoints of texts "x,y,z", or of one that names a file. Raises as `read_waypoints` and `parse_points`."""
+    if len(texts) == 1 and (Path(texts[0].strip()).exists() or texts[0].count(",") != 2):
+        return read_waypoints(texts[0].strip(), frame)
+    return parse_points(texts)
+
+
 def parse_points(texts: Sequence[str]) -> Waypoints:
     """Parse texts "x,y,z". Raises TableError if one is not three numbers."""
     parts = [text.split(",") for text in texts]

@@ -10,10 +10,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from wheretolook.dataset.config import ACCURACY, Accuracy
 from wheretolook.dataset.scene import ColmapFiles, Scene
+from wheretolook.extend.audit import Audit
+from wheretolook.extend.config import TargetOptions, check_extension
+from wheretolook.extend.places import drawn_views, free_places, pitches_within, views_around, yaws_around
+from wheretolook.extend.plan import Extension, Planner
 from wheretolook.geometry.camera import Camera, PinholeCamera, parse_camera
 from wheretolook.geometry.lattices import Lattice, direction_lattice
 from wheretolook.geometry.poses import Float, camera_centers, rigid_poses
@@ -24,7 +28,7 @@ from wheretolook.looks.next_look import NextLook, NextLookSelector, mean_scores_
 from wheretolook.mapping.config import FrameOptions
 from wheretolook.mapping.map_frame import MapFrame
 from wheretolook.scorers.base import Scorer
-from wheretolook.scorers.registry import make_scorer
+from wheretolook.scorers.registry import is_probability, make_scorer
 from wheretolook.scorers.weights import resolve_weights
 from wheretolook.select.selection import reported, select_views, usable_waypoints, with_reasons
 from wheretolook.select.waypoints import SelectionRequest, Waypoints, grid_waypoints
@@ -321,6 +325,88 @@ class WhereToLook:
     def select(self, waypoints: Waypoints, request: SelectionRequest, progress: bool = False) -> Views:
         """Select the requested views at waypoints; raises as `best`."""
         return select_views(self.scorer, self.reasons, self.directions, waypoints, request, progress)
+
+    def audit(
+        self, at: ArrayLike | Waypoints | Audit | None = None, heading_deg: ArrayLike | None = None, **options: Any
+    ) -> Audit:
+        """Score the views that a robot will have, at points (W, 3) of the map or in all free space.
+
+        Args:
+            at: locations of the camera, or an audit of another map, whose views are scored again; None for all free space
+                at the heights of the camera.
+            heading_deg: yaws (W,) of the robot at the points, for a limit on pan.
+            options: fields of `wheretolook.extend.config.TargetOptions`.
+
+        Raises:
+            TableError: as `best`.
+            ConfigError: an option is out of range, the scores are no probabilities, or a height is given without a floor.
+            SceneError: there is no place where a camera can be.
+        """
+        if not is_probability(self.scorer.name):
+            fix = "Use the method set, or another learned one."
+            raise ConfigError("the scores of this method are no probabilities", value=self.scorer.name, fix=fix)
+        check_names("option of audit", options, TargetOptions, ("at", "heading_deg"))
+        request = TargetOptions(**options)
+        to_world = self.frame.world_from_map
+        if isinstance(at, Audit):
+            poses = to_world.apply_to_poses(at.views.cam_from_world)
+            return replace(at, views=self._target_views(poses, at.views.waypoint, at.views.waypoint_id))
+        heading = None
+        apart_m = 1.0
+        if at is None:
+            places, apart_m = free_places(self.localization_map, self.space, request.height_m, 300)
+            waypoints = Waypoints.of(places)
+        else:
+            waypoints = Waypoints.of(at, (), heading_deg)
+            waypoints = waypoints[usable_waypoints(self.localization_map, waypoints, request.skip)]
+            places = to_world.apply(waypoints.points)
+            heading = None if request.pan_deg is None else waypoints.heading_deg(to_world.rotation)
+        pitches = pitches_within(request.pitch_deg)
+        limits = request.pan_deg or (-180.0, 180.0)
+        poses, rows = drawn_views(places, request.views, pitches, heading, limits, request.seed)
+        return Audit(self._target_views(poses, rows, tuple(waypoints.ids[row] for row in rows)), apart_m)
+
+    def _target_views(self, poses: Float, rows: NDArray[np.int64], names: Sequence[str]) -> Views:
+        """Return views at poses (T, 3, 4) in the world, with rows and names of their places, in the map's own frame."""
+        waypoints = Waypoints.of(camera_centers(poses), names)
+        views = with_reasons(self.reasons, reported(self.scorer, waypoints, np.arange(len(poses)), poses))
+        return replace(views, waypoint=rows).in_frame(self.frame)
+
+    def extend(
+        self,
+        n: int,
+        at: ArrayLike | Waypoints | None = None,
+        heading_deg: ArrayLike | None = None,
+        *,
+        until: float = 1.0,
+        least_p: float = 0.3,
+        **options: Any,
+    ) -> Extension:
+        """Plan the next photographs of the place, so that most views that a robot will have localize in the map.
+
+        They come in pairs, since a landmark needs two images; one of each pair registers in the map so far.
+
+        Args:
+            n: number of photographs.
+            at: where the robot's camera will be, as in `audit`; the photographs may be anywhere in free space.
+            heading_deg: yaws (W,) of the robot at the points, for a limit on pan.
+            until: share of the target views that localize at which the photographs end.
+            least_p: least probability that one of a pair registers.
+            options: fields of `wheretolook.extend.config.TargetOptions`.
+
+        Raises:
+            MapError: no photograph registers in the map.
+            TableError, ConfigError, SceneError: as `audit`; n is below 1, or a share is none.
+        """
+        check_extension(n, until, least_p)
+        audit = self.audit(at, heading_deg, **options)
+        request = TargetOptions(**options)
+        yaws = yaws_around(self.localization_map.camera)
+        pitches = pitches_within(request.pitch_deg)
+        most = 2400 // (yaws * len(pitches) * max(1, len(request.height_m)))
+        places, _ = free_places(self.localization_map, self.space, request.height_m, most)
+        candidates, _ = views_around(places, yaws, pitches)
+        return Planner(self.scorer, self.space, audit.views, candidates).plan(n, least_p, until, request.seed)
 
     def floor_plan(self, views: Views) -> Figure:
         """Draw views on a plan of the landmarks, in the map's unit, upright: a Matplotlib figure."""

@@ -182,7 +182,7 @@ def evaluate_look_sets(
     sets = pd.concat(results, ignore_index=True)
     folder = results_folder(dataset, evaluate)
     table = write_looks(folder, sets, f"Looks localized together on {dataset.name}, {evaluate.split} scenes")
-    params = {"dataset": dataset.name, "split": evaluate.split, "weights": weights.name}
+    params: dict[str, object] = {"dataset": dataset.name, "split": evaluate.split, "weights": weights.name}
     params |= {"numbers": numbers, "strategies": strategies}
     with kept_if_not_logged(f"the comparison of looks in {folder}"):
         log_looks(tracking, table, params, [folder / name for name in (LOOKS_CSV, LOOKS_MD)])

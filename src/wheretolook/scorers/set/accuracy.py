@@ -96,9 +96,9 @@ class AccuracyModel(LogisticRegression):
     def p_right_place(self, own: Any, statistics: Any, xp: Any = np) -> Any:
         """Return P(right place) (B,) of views with the network's probabilities (B,) and `STATISTICS` (B, S)."""
         finite = xp.clip(own, MARGIN, 1 - MARGIN)
-        of_odds, of_variance = self.weights
-        variance = statistics[:, STATISTICS.index("log_orientation_variance")]
-        log_odds = of_odds * xp.log(finite / (1 - finite)) + of_variance * variance + self.bias
+        log_odds = self.weights[0] * xp.log(finite / (1 - finite)) + self.bias
+        for weight, name in zip(self.weights[1:], self.names[1:], strict=True):
+            log_odds = log_odds + weight * statistics[:, STATISTICS.index(name)]
         return 1 / (1 + xp.exp(-log_odds))
 
     def log_errors(self, statistics: Any, xp: Any = np) -> Any:
@@ -142,8 +142,9 @@ class AccuracyModel(LogisticRegression):
 
 
 class PhotographModel(AccuracyModel):
-    """Both factors on maps of photographs. The probability at the network's own accuracy is only an input."""
+    """Both factors on maps of photographs. The network's probability is only an input of the first."""
 
+    names = ("log_odds",)
     about = "the accuracy of views on maps of photographs"
     file = Path(__file__).with_name("photographs.json")
     inputs = ()

@@ -91,11 +91,13 @@ def predict(model: ConfidenceModel, poses: pd.DataFrame, accuracy: Accuracy) -> 
     return place * np.min(below, axis=0)
 
 
-def main(poses: tuple[Path, ...]) -> None:
+def main(poses: tuple[Path, ...], place: bool = True) -> None:
     """Fit the model, judge each scene by a fit on the others, and print the model.
 
     Args:
         poses: `results/relocalize/poses.parquet` of datasets of validation scenes.
+        place: fit everything; otherwise only what corrects the bundled model by what is missing, for which the poses
+            are of scenes that repeat, too.
     """
     table = pd.concat([pd.read_parquet(path) for path in poses], ignore_index=True)
     table = table[table["n_inliers"] >= MIN_INLIERS].reset_index(drop=True)
@@ -112,7 +114,7 @@ def main(poses: tuple[Path, ...]) -> None:
         )
         right = f"{good[sure].mean():.3f} of {sure.sum()} at 0.99" if sure.any() else "none at 0.99"
         print(f"{accuracy[0]} m, {accuracy[1]} degrees: {good.mean():.3f} right; {numbers}; right {right}")
-    model = fit(table)
+    model = fit(table) if place else ConfidenceModel.bundled()
     errors = {name: vars(error) for name, error in zip(("position", "orientation"), model.errors, strict=True)}
     weights = dict(zip(model.names, model.weights, strict=True))
     by_missing = ConfidenceModel.bundled().by_missing

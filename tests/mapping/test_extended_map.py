@@ -4,6 +4,7 @@ import json
 import shutil
 
 import cv2
+import h5py
 import numpy as np
 import pycolmap
 import pytest
@@ -140,6 +141,20 @@ def test_a_model_of_colmap_without_features_is_extended_by_its_photographs(folde
     poses = images_of(read_model(tmp_path / "out"))
     for name, image in images_of(model).items():
         assert np.abs(poses[name].cam_from_world().matrix() - image.cam_from_world().matrix()).max() < 1e-9
+
+
+def test_features_of_hloc_beside_the_extended_model_are_not_taken_for_its(folders, tmp_path):
+    model = read_model(folders / "map")
+    names = [image.name for _, image in sorted(model.images.items())]
+    kind, stored = read_features(folders / "photographs" / "database.db", names)
+    with h5py.File(tmp_path / "feats-sift.h5", "w") as file:
+        for name, (pixels, descriptors) in zip(names, stored, strict=True):
+            file[f"{name}/keypoints"] = (pixels - 0.5).astype(np.float16)
+            file[f"{name}/descriptors"] = kind.restore(descriptors).T.astype(np.float16)
+    shutil.copytree(folders / "map", tmp_path / "sfm", ignore=shutil.ignore_patterns("landmarks.npz", "report.json"))
+    report = extend_map(tmp_path / "sfm", PhotographsConfig(folders / "new"), tmp_path / "more", progress=False)
+    assert report.n_placed == len(NEW)
+    assert len(Map.open_described(tmp_path / "more").landmarks) > model.num_points3D()
 
 
 def test_a_scene_is_made_of_the_extended_map(folders, tmp_path):

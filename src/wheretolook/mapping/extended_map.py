@@ -111,7 +111,12 @@ def extend_map(
             unplaced = _register(written, model, added, fixed, run)
         if len(unplaced) == len(names):
             fix = "Give photographs of the same place that overlap with those of the map."
-            raise MapError("none of the photographs can be placed in the map", path=images, value=unplaced, fix=fix)
+            raise MapError(
+                "none of the photographs can be placed in the map",
+                path=images,
+                value=dict([*unplaced.items()][:3]),
+                fix=fix,
+            )
         color_points(model, dict(zip(added, new.colors, strict=True)))
         model.update_point_3d_errors()
         longer = [point.track.length() > lengths.get(number, np.inf) for number, point in model.points3D.items()]

@@ -35,8 +35,8 @@ def list_photographs(folder: Path, at_least: int = 2) -> list[str]:
         if name != name.encode(errors="replace").decode():
             raise MapError("the name of a photograph is not in UTF-8", path=folder, value=name, fix="Rename it.")
     if len(names) < at_least:
-        fix = f"Files that end in {', '.join(SUFFIXES)} count."
-        raise MapError(f"there are fewer than {at_least} photographs", path=folder, value=len(names), fix=fix)
+        fix = f"Give at least {at_least}; files that end in {', '.join(SUFFIXES)} count."
+        raise MapError("there are too few photographs in the folder", path=folder, value=len(names), fix=fix)
     return names
 
 

@@ -23,8 +23,7 @@ def log_error_ratio(images: ModelArrays, cameras: Mapping[int, Camera], noise_px
     them, with Cauchy weights. Expected deviations are those of independent keypoint noise (pixels) in all images. Returns
     the mean of the medians for positions and orientations; None if keypoints are unknown, or too few images can be tested.
     """
-    pixels = images.observation_pixels
-    if pixels is None or len(images.image_ids) < 5 or not len(pixels):
+    if images.observation_pixels is None or len(images.image_ids) < 5 or not len(images.points):
         return None
     kept = np.zeros(len(images.points), dtype=bool)
     kept[:: max(1, -(-len(kept) // 20_000))] = True  # evenly spread
@@ -45,6 +44,7 @@ class _Tracks:
     """Rays of a map's observations (O), in the world, and their precisions in 1 / rad^2."""
 
     def __init__(self, images: ModelArrays, cameras: Mapping[int, Camera], noise_px: float) -> None:
+        assert images.observation_pixels is not None
         self.points = images.points
         self.point = images.observation_point
         self.image = images.observation_image

@@ -172,7 +172,7 @@ class ImageLocalizer:
     @cached_property
     def _rigs(self) -> JointLocalizer:
         # given rotations have a standard deviation of 0.2 degrees about each axis
-        return JointLocalizer(self._localizer.estimator, 0.2, check_turns=True)
+        return JointLocalizer(self._localizer.estimator, 0.2, True, self._localizer.expected)
 
     def localize(
         self,

@@ -100,12 +100,15 @@ def test_poses_are_those_of_the_localizer(folder):
     for (pixels, descriptors), pose in zip(views, POSES, strict=True):
         for own, expected in zip(robot.nearest(descriptors), matcher.nearest(descriptors, 16), strict=True):
             np.testing.assert_array_equal(own[:, 0], expected[:, 0])
-        best = robot.localize([robot.match(pixels, descriptors)]).poses[0]
+        result = robot.localize([robot.match(pixels, descriptors)])
+        best = result.poses[0]
         assert pose_error(best.cam_from_world, pose)[0] < 0.05
         look = Look.of(Keypoints(pixels, descriptors).pixels, match(matcher, [descriptors], 0.85, 16)[0], CAMERA)
         expected = localizer.joint.localize([look])
         np.testing.assert_allclose(best.cam_from_world, expected.rig_from_world, atol=1e-6)
         np.testing.assert_allclose(best.covariance, expected.covariance, rtol=1e-3)
+        assert result.joint.missing == pytest.approx(expected.missing, abs=1e-3)
+        assert result.probability == pytest.approx(expected.probability(), abs=1e-3)
     rig = robot.localize([robot.match(*view) for view in views], POSES[:, :, :3] @ POSES[0, :, :3].T)
     assert pose_error(rig.poses[0].cam_from_world, POSES[0])[0] < 0.02
     assert rig.probability == rig.poses[0].probability > 0.9

@@ -36,13 +36,16 @@ from wheretolook.features.extractor import ExtractorConfig
 from wheretolook.geometry.camera import Camera, CameraConfig, PinholeCamera, cameras_by_id, describe_camera, draw_camera
 from wheretolook.mapping.colmap_model import find_camera, read_model
 from wheretolook.mapping.config import FrameOptions, ImportConfig, MapConfig, PhotographsConfig, place_name
-from wheretolook.mapping.georeference import read_scale
+from wheretolook.mapping.feature_files import DATABASE_FILE
+from wheretolook.mapping.georeference import REPORT_FILE, read_scale
 from wheretolook.mapping.map import choose_features, source_of_map
 from wheretolook.mapping.map_frame import check_overlap, read_frame, warn_of_mesh
 from wheretolook.mapping.photographs import list_photographs
 from wheretolook.utils.errors import ConfigError, MapError, SceneError, reject
-from wheretolook.utils.files import cache_key, check_folder_name, fingerprint, path_within, size_and_time
+from wheretolook.utils.files import ArtifactCache, cache_key, check_folder_name, fingerprint, path_within, size_and_time
 from wheretolook.utils.processes import hold
+
+EXTENDED = "extended"  # of a scene: the model with added photographs, in the frame of the one before
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,14 +56,18 @@ class BuildMap(SceneOptions, LabelOptions, FrameOptions):
     according to --scale, --distance, --positions and --up. Mesh and database are optional. With --images its landmarks
     are triangulated again. Its own camera is the scene's, unless --camera names one.
 
+    --extend adds the photographs of --images to an existing map, whose poses stay as they are.
+
     Examples:
       wheretolook map --name photos --images FOLDER
       wheretolook map --name mymap --model sparse/0 --mesh scan.glb --database database.db
+      wheretolook map --name more --extend data/photos/room --images NEW
 
     Args:
         mapping: maps of renders.
         photographs: maps of photographs, and the images and markers of a model.
         model: folder of a COLMAP model to import.
+        extend: folder of a COLMAP or hloc model, or of a scene, to add the photographs to.
         mesh: textured mesh of the scene in the model's frame, for free space, occlusion and labels. Without one, free
             space follows `scenes.mapped_space`, and occlusion hidden-point removal.
         mesh_up: which axis of the mesh's file is the model's z: x, y or z, with a minus sign if it points down.
@@ -83,6 +90,7 @@ class BuildMap(SceneOptions, LabelOptions, FrameOptions):
     mapping: MapConfig = field(default_factory=MapConfig)
     photographs: PhotographsConfig = field(default_factory=PhotographsConfig)
     model: Path | None = None
+    extend: Path | None = None
     mesh: Path | None = None
     mesh_up: str = "z"
     database: Path | None = None
@@ -102,7 +110,16 @@ class BuildMap(SceneOptions, LabelOptions, FrameOptions):
                 of_renders,
             ),
             (is_rendered and frame != FrameOptions(), "scale and up belong to --model or --images", vars(frame)),
-            (self.model is None and bool(of_model), "these belong to --model", of_model),
+            (
+                self.model is None and self.extend is None and bool(of_model),
+                "these belong to --model or --extend",
+                of_model,
+            ),
+            (
+                self.extend is not None and (self.model is not None or self.photographs.images is None),
+                "--extend takes --images, and no --model",
+                str(self.extend),
+            ),
             (
                 self.mapping.extractor != ExtractorConfig(),
                 "the extractor is given beside mapping: BuildMap(extractor=...)",
@@ -111,7 +128,7 @@ class BuildMap(SceneOptions, LabelOptions, FrameOptions):
         )
         if self.model is not None:
             _ = self.import_config
-        elif not is_rendered:
+        elif not is_rendered and self.extend is None:
             _ = self.photographs_config
 
     @property
@@ -154,13 +171,16 @@ class BuildMap(SceneOptions, LabelOptions, FrameOptions):
                 progress(1)
             return dataset
         refuse_release(self.root)
-        source = self.model or self.photographs.images
+        source = self.extend or self.model or self.photographs.images
         assert source is not None
-        with hold(_new_scene(self, source).folder / LOCK, "map"):
-            if self.model is not None:
-                scene, dataset = _import_model(self, log)
+        new = _new_scene(self, source)
+        with hold(new.folder / LOCK, "map"):
+            if self.extend is not None:
+                scene, dataset = _import_model(_extend(self, new, log), new, log)
+            elif self.model is not None:
+                scene, dataset = _import_model(self, new, log)
             else:
-                scene = _map_photographs(self, log)
+                scene = _map_photographs(self, new, log)
                 dataset = _with_scene(scene, self.root)
         frame = read_frame(scene.map)
         about = "; ".join((frame.describe(), *frame.doubts))
@@ -223,7 +243,38 @@ def _seed(scene: SceneFolder) -> int:
     return zlib.crc32(scene.name.encode()) % 2**31
 
 
-def _map_photographs(options: BuildMap, log: Log) -> SceneFolder:
+def _extend(options: BuildMap, scene: SceneFolder, log: Log) -> BuildMap:
+    """Add photographs to the model in `extend`: `<scene>/extended/`. Returns options that import the result.
+
+    Raises what `extend_map` does.
+    """
+    source, images = options.extend, options.photographs.images
+    assert source is not None and images is not None
+    extended = scene.folder / EXTENDED
+    database = extended / DATABASE_FILE
+    files = [*source.rglob("*"), *(images / name for name in list_photographs(images, 1))]
+    files += filter(None, [options.database])
+    config = replace(options.photographs, extractor=options.extractor)
+    key = cache_key("extend", config.record(), options.extractor.record(), size_and_time(filter(Path.is_file, files)))
+    cache = ArtifactCache(extended, key, "extend", "steps.json")
+    if not cache.is_current(database, extended / REPORT_FILE):
+        from wheretolook.mapping.extended_map import extend_map  # loads pycolmap
+
+        report = extend_map(
+            source, config, extended, options.database, _seed(scene), options.n_workers, options.warp_device
+        )
+        cache.store()
+        placed = f"{report.n_placed} of {report.n_photographs} photographs placed, {len(report.skipped)} known before"
+        landmarks = f"{report.n_new_landmarks:,} new landmarks, {report.n_extended_landmarks:,} seen more often"
+        log(f"{scene.name}: {placed}; {landmarks} -> {extended}")
+        for name, reason in report.unplaced.items():
+            log(f"{scene.name}: not placed: {name}: {reason}")
+    number = options.camera_id or _most_used_camera(read_model(extended))
+    result = replace(options, extend=None, model=extended, database=database, camera_id=number)
+    return replace(result, photographs=PhotographsConfig(), scene=scene.name)
+
+
+def _map_photographs(options: BuildMap, scene: SceneFolder, log: Log) -> SceneFolder:
     """Map the photographs in `photographs.images`: `<scene>/map/`, with finished steps in `<scene>/photographs/`.
 
     Returns the scene, with the camera of most photographs unless one is configured. Raises what `map_photographs` does.
@@ -231,7 +282,6 @@ def _map_photographs(options: BuildMap, log: Log) -> SceneFolder:
     settings = options.photographs_config
     folder = settings.images
     assert folder is not None
-    scene = _new_scene(options, folder)
     _with_scene(scene, options.root)
     tables = list(filter(None, (settings.scale.marker_table, settings.frame.positions)))
     for path in tables:
@@ -267,14 +317,13 @@ def _map_photographs(options: BuildMap, log: Log) -> SceneFolder:
     return _with_mapping_camera(options, scene)
 
 
-def _import_model(options: BuildMap, log: Log) -> tuple[SceneFolder, Dataset]:
+def _import_model(options: BuildMap, scene: SceneFolder, log: Log) -> tuple[SceneFolder, Dataset]:
     """Make a scene of the model in `options.model`: `<scene>/map/`, and `<scene>/mesh.glb` if a mesh is given.
 
     Returns the scene, and the dataset with it. Raises what `map_existing` does, and SceneError if the mesh cannot be used.
     """
     settings = options.import_config
     folder = settings.model
-    scene = _new_scene(options, folder)
     model = read_model(folder)
     if settings.images is None:
         settings = replace(settings, database=choose_features(folder, model, settings.database))
@@ -337,6 +386,8 @@ def _new_scene(options: BuildMap, source: Path) -> SceneFolder:
         fix = f"Name the scene instead of its map: --name {options.name} --scene {name}."
         raise ConfigError("this is a part of a scene, which would be replaced", path=source, fix=fix)
     known = source_of_map(scene.map)
+    if known == scene.folder / EXTENDED:
+        known = source_of_map(known)
     if known is not None and known.resolve() != source.resolve():
         fix = f"Give another dataset, --name, or remove {scene.folder}."
         raise ConfigError(f"the scene {name} was made from another source", path=known, value=str(source), fix=fix)
@@ -348,9 +399,15 @@ def _with_mapping_camera(options: BuildMap, scene: SceneFolder) -> SceneFolder:
     if options.camera != CameraConfig():
         return scene
     model = read_model(scene.map)
+    camera = cameras_by_id(model.cameras, scene.map)[_most_used_camera(model)]
+    return replace(scene, camera=camera, own_camera=True)
+
+
+def _most_used_camera(model: Any) -> int:
+    """Return the camera_id of most images with a pose."""
     taken = Counter(image.camera_id for image in model.images.values() if image.has_pose)
     ((number, _),) = taken.most_common(1)
-    return replace(scene, camera=cameras_by_id(model.cameras, scene.map)[number], own_camera=True)
+    return int(number)
 
 
 def _with_own_camera(scene: SceneFolder, model: Any, folder: Path, camera_id: int | None) -> SceneFolder:

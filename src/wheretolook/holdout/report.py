@@ -226,6 +226,12 @@ class CheckReport:
         if ratios := numbers["inliers_found_over_expected"]:
             good, every = (_with_interval(ratios[name], 2) for name in ("localized", "all"))
             lines.append(f"inliers over expected: {good} of views that localize, {every} of all")
+        if of_map := numbers.get("map"):
+            noise_px, scale, offset = of_map.values()
+            lines.append(
+                f"keypoint noise of the map {noise_px:.2f} px, errors as of {scale:.2f} px; log-odds of detection "
+                f"{offset or 0:+.2f}"
+            )
         if source.fov_deg is not None:
             lines.append(f"views of {source.fov_deg:g} degrees, {source.n_crops} of each photograph")
         if numbers["share_in_range"] < 1:
@@ -281,6 +287,14 @@ def check_map(
     columns[VISIBLE] = columns.pop(VISIBLE)  # the baseline comes last
     centers = (source.own_centers * source.from_model.scale)[scored["row"].to_numpy()]
     numbers = measure(scored, columns, centers, source.place_radius, is_probability(method))
+    known = source.map.computed if source.photographs else {}
+    if "error_scale" in known:
+        offsets = [value for key, value in known.items() if isinstance(key, tuple)]
+        numbers["map"] = {
+            "keypoint_noise_px": source.map.landmarks.keypoint_noise_px,
+            "error_scale": known["error_scale"],
+            "detection_offset": offsets[0] if offsets else None,
+        }
     middle = scored[scored["crop"] == 0]
     parts = weak_parts(source, results, middle)
     photographs = _photographs(source, middle, parts)

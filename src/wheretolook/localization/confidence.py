@@ -56,7 +56,11 @@ class LogisticRegression:
 
     def predict_proba(self, features: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
         """Return probabilities (...,) for feature vectors (..., K) in the order of `names`."""
-        return np.asarray(1 / (1 + np.exp(-np.clip(features @ np.asarray(self.weights) + self.bias, -60, 60))))
+        return np.asarray(1 / (1 + np.exp(-self.log_odds(features))))
+
+    def log_odds(self, features: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
+        """Return the log-odds (...,) of `predict_proba`, within -60 and 60."""
+        return np.asarray(np.clip(features @ np.asarray(self.weights) + self.bias, -60, 60))
 
 
 RIGHT_PLACE: Accuracy = (math.inf, math.inf)
@@ -119,13 +123,18 @@ class ConfidenceModel(LogisticRegression):
     file = Path(__file__).with_name("confidence.json")
 
     errors: tuple[ErrorModel, ...] = ()  # of the position (m) and of the orientation (degrees)
+    # where the share of missing landmarks is known: slope of the log-odds of the right place without it, weight of its
+    # log, and bias
+    by_missing: tuple[float, float, float] = (1.0, 0.0, 0.0)
 
     @classmethod
     def load(cls, path: Path) -> Self:
         """Read the JSON file of both factors."""
         place = super().load(path)
-        errors = read_json_object(path)["errors"]
-        return cls(place.weights, place.bias, tuple(ErrorModel(**errors[name]) for name in ("position", "orientation")))
+        stored = read_json_object(path)
+        errors = tuple(ErrorModel(**stored["errors"][name]) for name in ("position", "orientation"))
+        slope, weight, bias = (float(stored["missing"][name]) for name in ("slope", "weight", "bias"))
+        return cls(place.weights, place.bias, errors, (slope, weight, bias))
 
     def p_within(
         self,
@@ -135,14 +144,23 @@ class ConfidenceModel(LogisticRegression):
         unique_support: tuple[int, int],
         deviation: tuple[float, float],
         accuracy: Accuracy,
+        missing: float | None = None,
     ) -> float:
-        """Probability that a pose is within an accuracy, given attributes of its `JointLocalization`."""
+        """Probability that a pose is within an accuracy, given attributes of its `JointLocalization`.
+
+        `missing` is the share of the landmarks expected where none is found (`ExpectedLandmarks`); None if unknown.
+        """
         if n_inliers < MIN_INLIERS:
             return 0.0
         unique, rival_unique = unique_support
         features = confidence_features(n_inliers, n_matches, rival_support, unique, rival_unique, deviation[1])
         limits = zip(self.errors, accuracy, deviation, strict=True)
-        place = float(self.predict_proba(features))
+        log_odds = float(self.log_odds(features))
+        if missing is not None:
+            slope, weight, bias = self.by_missing
+            # few poses are surer, and however many inliers cannot outweigh what is missing
+            log_odds = slope * float(np.clip(log_odds, -7, 7)) + weight * math.log(max(missing, 0.02)) + bias
+        place = 1 / (1 + math.exp(-log_odds))
         probability = place * min(model.p_below(limit, own) for model, limit, own in limits)
         # random matches of features that hardly match reach eleven inliers, with which poses were not fitted
         return probability if n_inliers >= 12 else min(probability, 0.5)

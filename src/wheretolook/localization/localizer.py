@@ -29,10 +29,11 @@ from wheretolook.geometry.similarity import poses_from
 from wheretolook.localization.config import LocalizerConfig
 from wheretolook.localization.estimation import PoseEstimator
 from wheretolook.localization.lightglue import LightGlueMatcher
+from wheretolook.localization.missing import ExpectedLandmarks
 from wheretolook.localization.rig import Look
 from wheretolook.localization.rig_localization import POSES_OF_AN_IMAGE, JointLocalizer
 from wheretolook.mapping.colmap_model import ModelArrays
-from wheretolook.mapping.landmarks import Landmarks
+from wheretolook.mapping.landmarks import MAP_ATTRIBUTES, Landmarks
 from wheretolook.utils.errors import MapError
 
 Matcher = DescriptorMatcher | DescriptorIndex | SimilarityMatcher
@@ -198,7 +199,15 @@ class Localizer:
     @cached_property
     def joint(self) -> JointLocalizer:
         """Localizes one view or several with exactly known rotations by several hypotheses."""
-        return JointLocalizer(self.estimator)
+        return JointLocalizer(self.estimator, expected=self.expected)
+
+    @cached_property
+    def expected(self) -> ExpectedLandmarks:
+        """Landmarks that a pose should have found."""
+        landmarks = self.landmarks
+        return ExpectedLandmarks.of(
+            landmarks.points, landmarks.mapping_direction, landmarks.attributes(), MAP_ATTRIBUTES
+        )
 
     def estimate(self, keypoints: Keypoints, matches: Matches, camera: Camera | None = None) -> Localization:
         """Estimate the pose of an image from its matches."""

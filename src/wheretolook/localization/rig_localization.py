@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from wheretolook.dataset.config import ACCURACY, CONTRADICTED, LOCALIZED, NO_POSE, TOO_FEW_MATCHES, Accuracy
 from wheretolook.geometry.poses import Float
 from wheretolook.geometry.similarity import poses_from
-from wheretolook.localization.confidence import ConfidenceModel
+from wheretolook.localization.confidence import MIN_INLIERS, ConfidenceModel
 from wheretolook.localization.estimation import (
     MIN_MATCHES,
     RIVAL_TRIALS,
@@ -31,6 +31,7 @@ from wheretolook.localization.estimation import (
     strongest_rival,
     turn_errors,
 )
+from wheretolook.localization.missing import ExpectedLandmarks
 from wheretolook.localization.rig import Look
 from wheretolook.utils.errors import check_range
 
@@ -61,6 +62,7 @@ class JointLocalization:
             do not determine the pose.
         rivals: the other hypotheses, by decreasing evidence, without rivals of their own.
         turn_error_deg: largest error of the known rotations if the images contradict them; else 0.
+        expected: the landmarks of the map, if it is known what decides whether they are detected.
     """
 
     status: str
@@ -75,6 +77,7 @@ class JointLocalization:
     covariance: Float = field(default_factory=lambda: np.full((6, 6), np.inf))
     rivals: tuple[JointLocalization, ...] = ()
     turn_error_deg: float = 0.0
+    expected: ExpectedLandmarks | None = None
 
     @property
     def n_inliers(self) -> int:
@@ -87,10 +90,24 @@ class JointLocalization:
         variance = np.diagonal(self.covariance)
         return float(np.sqrt(variance[:3].sum())), float(np.degrees(np.sqrt(variance[3:].sum())))
 
+    @cached_property
+    def missing(self) -> float | None:
+        """Share of the expected detections in parts of the images without inliers; None if none can be expected."""
+        if self.expected is None or self.cams_from_world is None:
+            return None
+        return self.expected.missing(self.looks, self.cams_from_world, self.inliers)
+
     def probability(self, accuracy: Accuracy = ACCURACY) -> float:
         """Probability that the pose is within an accuracy, 0 if there is no pose."""
+        n_inliers = self.n_inliers
         return ConfidenceModel.bundled().p_within(
-            self.n_inliers, self.n_matches, self.rival_support, self.unique_support, self.deviation, accuracy
+            n_inliers,
+            self.n_matches,
+            self.rival_support,
+            self.unique_support,
+            self.deviation,
+            accuracy,
+            self.missing if n_inliers >= MIN_INLIERS else None,
         )
 
     def probabilities(self, accuracy: Accuracy = ACCURACY) -> Float:
@@ -113,11 +130,18 @@ class JointLocalizer:
     poses are compared with these: if they contradict them, the noise that they imply replaces it (`turn_errors`).
     """
 
-    def __init__(self, estimator: PoseEstimator, turn_noise_deg: float = 0.0, check_turns: bool = False) -> None:
+    def __init__(
+        self,
+        estimator: PoseEstimator,
+        turn_noise_deg: float = 0.0,
+        check_turns: bool = False,
+        expected: ExpectedLandmarks | None = None,
+    ) -> None:
         check_range("the noise of rotations in degrees", turn_noise_deg, 0, 90)
         self.estimator = estimator
         self.turn_noise_deg = turn_noise_deg
         self.check_turns = check_turns
+        self.expected = expected
 
     @cached_property
     def ambiguity(self) -> PoseAmbiguity:
@@ -223,6 +247,7 @@ class JointLocalizer:
                 rival_support=max(support[:k] + support[k + 1 :], default=0.0),
                 unique_support=own,
                 covariance=pose.covariance,
+                expected=self.expected,
             )
             results.append(result)
         chosen = 0 if first else most_likely(unique, support)

@@ -224,6 +224,7 @@ class ModelArrays:
     observation_start: NDArray[np.int64]  # (P + 1,); observations start[i] to start[i + 1] belong to point i
     observation_image: NDArray[np.int64]  # (O,) row in `image_ids`
     observation_keypoint: NDArray[np.int64]  # (O,) index of the keypoint in its image
+    observation_pixels: NDArray[np.float32] | None = None  # (O, 2) its position
 
     @property
     def track_lengths(self) -> NDArray[np.int64]:
@@ -409,10 +410,10 @@ def model_arrays(reconstruction: Any) -> ModelArrays:
 
     Raises MapError if a track names an image without a pose.
     """
-    points, elements = _points_and_tracks(reconstruction)
+    points, elements, pixels = _points_and_tracks(reconstruction)
     if not (points["error"][points["n"] > 0] >= 0).all():  # COLMAP writes -1 for an unknown error
         reconstruction.update_point_3d_errors()
-        points, elements = _points_and_tracks(reconstruction)
+        points, elements, pixels = _points_and_tracks(reconstruction)
     image_ids = np.array(sorted(i for i, image in reconstruction.images.items() if image.has_pose), dtype=np.int64)
     images = [reconstruction.images[i] for i in image_ids]
     if not np.isin(elements[:, 0], image_ids).all():
@@ -430,6 +431,7 @@ def model_arrays(reconstruction: Any) -> ModelArrays:
         observation_start=np.concatenate([[0], np.cumsum(points["n"])]).astype(np.int64),
         observation_image=np.searchsorted(image_ids, elements[:, 0]),
         observation_keypoint=elements[:, 1].astype(np.int64),
+        observation_pixels=pixels,
     )
 
 
@@ -445,6 +447,7 @@ def select_points(model: ModelArrays, keep: NDArray[np.bool_]) -> ModelArrays:
         observation_start=np.concatenate([[0], np.cumsum(lengths[keep])]),
         observation_image=model.observation_image[rows],
         observation_keypoint=model.observation_keypoint[rows],
+        observation_pixels=None if model.observation_pixels is None else model.observation_pixels[rows],
     )
 
 
@@ -528,8 +531,25 @@ def load_mapping_poses(path: str | Path) -> Float:
         raise MapError(f"cannot read the mapping images' poses: {error}", path=path, fix=fix) from error
 
 
-def _points_and_tracks(reconstruction: Any) -> tuple[NDArray[Any], NDArray[np.uint32]]:
-    """Points and tracks of a reconstruction as `read_points` gives them."""
+def _points_and_tracks(reconstruction: Any) -> tuple[NDArray[Any], NDArray[np.uint32], NDArray[np.float32]]:
+    """Points and tracks of a reconstruction as `read_points` gives them, and the pixels (O, 2) of the tracks."""
     with temporary_folder() as folder:
         reconstruction.write_binary(folder)
-        return read_points(folder / "points3D.bin")
+        points, elements = read_points(folder / "points3D.bin")
+        return points, elements, _read_pixels(folder / "images.bin", elements)
+
+
+def _read_pixels(path: Path, elements: NDArray[np.uint32]) -> NDArray[np.float32]:
+    """Read where keypoints are, (O, 2), from an images.bin; elements (O, 2) are their image ids and indices."""
+    data = _mapped(path)
+    starts = _record_starts(data, _image_length, path)
+    order = np.argsort(elements[:, 0], kind="stable")
+    ids = _records(data, starts[:-1], np.dtype("<u4")).reshape(-1)
+    first, last = (np.searchsorted(elements[order, 0], ids, side) for side in ("left", "right"))
+    keypoint = np.dtype([("xy", "<f8", 2), ("point", "<u8")])
+    pixels = np.empty((len(elements), 2), dtype=np.float32)
+    for start, end, begin, stop in zip(starts[:-1], starts[1:], first, last, strict=True):
+        name_end = start + 64 + bytes(data[start + 64 : end]).index(b"\0") + 1
+        rows = order[begin:stop]
+        pixels[rows] = data[name_end + 8 : end].view(keypoint)["xy"][elements[rows, 1]]
+    return pixels

@@ -81,7 +81,8 @@ def features_kind(features: Path, reconstruction: Any) -> DescriptorKind | None:
 
     Raises MapError if the file is missing, unreadable, or not the one the model was built from, or h5py is missing.
     """
-    images = [image for _, image in sorted(reconstruction.images.items()) if image.num_points3D][:3]
+    images = [image for _, image in sorted(reconstruction.images.items()) if image.num_points3D]
+    images = images[:2] + images[2:][-1:]  # photographs that were added have the last ids
     kind = None
     for image, found in zip(images, _read_images(features, [image.name for image in images]), strict=True):
         _check_keypoints(found, image, features)
@@ -89,11 +90,13 @@ def features_kind(features: Path, reconstruction: Any) -> DescriptorKind | None:
     return kind
 
 
-def read_features(features: str | Path, names: Sequence[str]) -> tuple[DescriptorKind, list[Stored]]:
+def read_features(
+    features: str | Path, names: Sequence[str], reconstruction: Any = None
+) -> tuple[DescriptorKind, list[Stored]]:
     """Read keypoints and descriptors of images by their names, from a file of features as `read_descriptors` does.
 
-    Raises MapError if the file is missing or unreadable, lacks an image, or one of them has no descriptors of a known
-    kind.
+    Raises MapError if the file is missing or unreadable, lacks an image, one of them has no descriptors of a known kind,
+    or other keypoints than in a reconstruction, which has them exactly.
     """
     path = Path(features)
     images = [*_read_images(path, names)]
@@ -103,6 +106,10 @@ def read_features(features: str | Path, names: Sequence[str]) -> tuple[Descripto
         if image.descriptors is None and len(image.keypoints):
             problem = f"this image has no descriptors of {', '.join(KINDS)} in this file"
             raise MapError(problem, path=path, value=name, fix="hloc keeps them in HDF5: --database feats-*.h5.")
+        in_model = None if reconstruction is None else reconstruction.find_image_with_name(name)
+        if in_model is not None and in_model.num_points2D():  # hloc's have none in images that observe nothing
+            _check_keypoints(image, in_model, path)
+            image = image._replace(keypoints=np.array([point.xy for point in in_model.points2D]))
         descriptors = kind.none() if image.descriptors is None else image.descriptors
         stored.append((image.keypoints.astype(np.float32), descriptors))
     return kind, stored

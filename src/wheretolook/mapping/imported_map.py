@@ -80,7 +80,7 @@ def map_existing(
             with run.clock("extract"):
                 names = list(registered_names(model).values())
                 features = photograph_features(images, work, run, config.max_side_px, names, turned)
-            model = _triangulate(model, images, features, database, run)
+            model = triangulate_at_poses(model, images, features, database, run)
         with run.clock("frame"):
             marked = MarkedPhotographs(config.scale, images, turned, progress)
             frame = find_frame(config.model, model, config.frame, photographs=marked)
@@ -108,7 +108,7 @@ def map_existing(
     return report
 
 
-def _triangulate(source: Any, images: Path, features: PhotographFeatures, database: Path, run: MapRun) -> Any:
+def triangulate_at_poses(source: Any, images: Path, features: PhotographFeatures, database: Path, run: MapRun) -> Any:
     """Triangulate new landmarks at the poses of a model, from keypoints of its images. Returns a new model."""
     with run.clock("pairs"):
         pairs = _pairs(source)

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from wheretolook.features.extractor import SIFT, DescriptorKind
+from wheretolook.features.extractor import SIFT, DescriptorKind, ExtractorConfig, kind_of, runnable_extractors
 from wheretolook.geometry.camera import Camera, cameras_by_id
 from wheretolook.geometry.poses import Float
 from wheretolook.mapping.colmap_model import (
@@ -32,7 +32,7 @@ from wheretolook.mapping.feature_files import DATABASE_FILE, HDF5_SUFFIXES, feat
 from wheretolook.mapping.georeference import REPORT_FILE
 from wheretolook.mapping.landmarks import Landmarks, landmarks_of, load_colmap_landmarks
 from wheretolook.mapping.map_frame import IDENTITY, MapFrame, find_frame, has_photographs
-from wheretolook.utils.errors import ConfigError, MapError, MapWarning
+from wheretolook.utils.errors import ConfigError, MapError, MapWarning, from_record
 from wheretolook.utils.files import path_within, read_json_object
 from wheretolook.utils.texts import LOG
 
@@ -155,6 +155,23 @@ def _kind_or_problem(path: Path, reconstruction: Any) -> tuple[DescriptorKind | 
     except MapError as error:
         return None, str(error)
     return kind, "" if kind else f"{path} has no descriptors of a known kind"
+
+
+def extractor_of(map_dir: Path, kind: DescriptorKind | None) -> ExtractorConfig:
+    """Return the extractor in the report of a map of this project, or the first one with descriptors of a kind.
+
+    None is any kind, without a report SIFT. Raises MapError if none of it can be run.
+    """
+    with suppress(OSError, ValueError, KeyError, TypeError):
+        stated: Any = read_json_object(map_dir / REPORT_FILE)["config"]["extractor"]
+        recorded = from_record(ExtractorConfig, stated)
+        if kind in (None, kind_of(recorded.method)):  # not if the descriptors come from elsewhere
+            return recorded
+    for name in runnable_extractors():
+        if kind in (None, kind_of(name)):
+            return ExtractorConfig(name)
+    problem = "no extractor for the descriptors of this map can be run here"
+    raise MapError(problem, path=map_dir, value=kind and kind.name, fix="Map with SIFT, ALIKED, DISK or XFeat.")
 
 
 def source_of_map(map_dir: Path) -> Path | None:
@@ -318,6 +335,7 @@ class Map:
             observation_start=np.concatenate([[0], np.cumsum(counts)]),
             observation_image=images.observation_image[observations],
             observation_keypoint=images.observation_keypoint[observations],
+            observation_pixels=None,
         )
         return landmarks_of(self.landmarks, select_points(left, counts >= 2))
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -66,7 +66,16 @@ class MapDraft:
 
 
 @dataclass(frozen=True)
-class MapReport:
+class SavedReport:
+    """What was done to make a map."""
+
+    def save(self, folder: Path) -> None:
+        """Write the report into a map's folder."""
+        write_text(folder / REPORT_FILE, json.dumps(asdict(self), indent=2, default=str) + "\n")
+
+
+@dataclass(frozen=True)
+class MapReport(SavedReport):
     """Properties of a map from any source; `report.json`."""
 
     n_images: int  # rendered images, photographs, or images of the existing model with a pose
@@ -77,10 +86,6 @@ class MapReport:
     seed: int  # seed of the walk and of COLMAP
     config: dict[str, Any]  # the configuration, as a dictionary
     seconds: dict[str, float]  # wall-clock time of each step
-
-    def save(self, folder: Path) -> None:
-        """Write the report into a map's folder."""
-        write_text(folder / REPORT_FILE, json.dumps(asdict(self), indent=2, default=str) + "\n")
 
 
 @contextmanager
@@ -115,7 +120,7 @@ def finish_map(draft: MapDraft, folder: Path, run: MapRun) -> tuple[Landmarks, d
     with run.clock("filter_and_write"):
         n_removed = _remove_inaccurate(draft) if draft.max_error_px else 0
         if draft.colors:
-            color_points(model, draft.colors)
+            color_points(model, dict(enumerate(draft.colors, 1)))
         write_model(model, folder)
     with run.clock("landmarks"):
         landmarks = load_colmap_landmarks(draft.source, draft.database, None, draft.search_device, model, run.progress)
@@ -149,8 +154,13 @@ def _remove_inaccurate(draft: MapDraft) -> int:
     return len(removed)
 
 
-def color_points(model: Any, colors: Sequence[NDArray[np.uint8]]) -> None:
-    """Set the colour of each point of a reconstruction to the mean over its keypoints, (N_i, 3) uint8 of image i + 1."""
+def color_points(model: Any, colors: Mapping[int, NDArray[np.uint8]]) -> None:
+    """Set the colour of each point of a reconstruction to the mean over its keypoints, (N, 3) uint8 of images by id.
+
+    Points that none of these images observes stay as they are.
+    """
     for point in model.points3D.values():
-        observed = [colors[element.image_id - 1][element.point2D_idx] for element in point.track.elements]
-        point.color = np.rint(np.mean(observed, axis=0)).astype(np.uint8)
+        track = [element for element in point.track.elements if element.image_id in colors]
+        observed = [colors[element.image_id][element.point2D_idx] for element in track]
+        if observed:
+            point.color = np.rint(np.mean(observed, axis=0)).astype(np.uint8)

@@ -121,8 +121,9 @@ def match_and_map(
         database.unlink(missing_ok=True)
         shutil.rmtree(folder, ignore_errors=True)
         with storing_in_database(database):
-            fill_database(database, _unposed_model(features, cameras), features.stored, features.kind)
-            write_matches(database, arrays["pairs"], matches)
+            model = _unposed_model(features, cameras)
+            fill_database(database, model, features.stored, features.kind)
+            write_matches(database, arrays["pairs"], matches, sorted(model.images))
             results = cache.store({"sparse.json": _reconstruct(database, folder, cameras, seed, run)})
     return MappedPhotographs(read_model(folder), database, **results["sparse.json"])
 
@@ -178,11 +179,7 @@ def _reconstruct(database: Path, folder: Path, cameras: PhotographCameras, seed:
     The next mapper is tried while the largest model has fewer than half of the photographs that verified matches
     connect. Raises MapError if none of them gives a model.
     """
-    verification = pycolmap.TwoViewGeometryOptions()
-    verification.ransac.random_seed = seed
-    with quiet_colmap("ERROR"):
-        verifier = pycolmap.GeometricVerifierOptions(num_threads=run.processes.workers)
-        pycolmap.geometric_verification(str(database), verifier, two_view_geometry_options=verification)
+    verify_matches(database, run)
     enough = _connected(database, len(cameras.camera_of)) / 2
     attempts: dict[str, Callable[[Path], dict[int, Any]]] = {
         "incremental": lambda models: _map_incrementally(database, models, cameras, seed, run),
@@ -208,6 +205,15 @@ def _reconstruct(database: Path, folder: Path, cameras: PhotographCameras, seed:
         raise MapError(problem, path=database, fix=fix)
     write_model(best[0], folder)
     return {"model_sizes": [model.num_reg_images() for model in best], "mappers": mappers}
+
+
+def verify_matches(database: Path, run: MapRun) -> None:
+    """Verify the matches in a COLMAP database by two-view geometry."""
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = run.seed % 2**31  # COLMAP keeps it in an int
+    with quiet_colmap("ERROR"):
+        verifier = pycolmap.GeometricVerifierOptions(num_threads=run.processes.workers)
+        pycolmap.geometric_verification(str(database), verifier, two_view_geometry_options=verification)
 
 
 def _connected(database: Path, n: int) -> int:

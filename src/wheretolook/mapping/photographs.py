@@ -23,10 +23,10 @@ from wheretolook.utils.texts import LOG, quiet_colmap
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
 
 
-def list_photographs(folder: Path) -> list[str]:
+def list_photographs(folder: Path, at_least: int = 2) -> list[str]:
     """List photographs in a folder and its subfolders by relative name, as `find_photograph_files` does.
 
-    Raises MapError if there are fewer than two, or a name is not in UTF-8, which COLMAP needs.
+    Raises MapError if there are fewer than `at_least`, or a name is not in UTF-8, which COLMAP needs.
     """
     if not folder.is_dir():
         raise MapError("there is no such folder", path=folder, fix="Give the folder of the photographs.")
@@ -34,9 +34,9 @@ def list_photographs(folder: Path) -> list[str]:
     for name in names:
         if name != name.encode(errors="replace").decode():
             raise MapError("the name of a photograph is not in UTF-8", path=folder, value=name, fix="Rename it.")
-    if len(names) < 2:
-        fix = f"Files that end in {', '.join(SUFFIXES)} count."
-        raise MapError("a map needs at least two photographs", path=folder, value=len(names), fix=fix)
+    if len(names) < at_least:
+        fix = f"Give at least {at_least}; files that end in {', '.join(SUFFIXES)} count."
+        raise MapError("there are too few photographs in the folder", path=folder, value=len(names), fix=fix)
     return names
 
 

@@ -99,7 +99,8 @@ def triangulate_model(
                 model.images[index + 1].points2D = pycolmap.Point2DList(points)
             fill_database(database, model, stored, kind)
         with clock("match"):
-            write_matches(database, pairs, match_pairs(stored, pairs, folder, run.processes, run.progress, kind))
+            matches = match_pairs(stored, pairs, folder, run.processes, run.progress, kind)
+            write_matches(database, pairs, matches, sorted(model.images))
         with clock("verify"), quiet_colmap():
             verification = pycolmap.TwoViewGeometryOptions()
             verification.ransac.max_error = MAX_EPIPOLAR_ERROR_PX
@@ -117,15 +118,17 @@ def triangulate_model(
         model.transform(to_local.inverse())
         model.update_point_3d_errors()
     with clock("color"):
-        color_points(model, colors)
+        color_points(model, dict(enumerate(colors, 1)))
     return model
 
 
-def write_matches(database: Path, pairs: NDArray[np.int64], matches: Iterable[NDArray[np.uint32]]) -> None:
-    """Write matches (M, 2) of each pair (P, 2) of images into a COLMAP database; image i has the id i + 1."""
+def write_matches(
+    database: Path, pairs: NDArray[np.int64], matches: Iterable[NDArray[np.uint32]], ids: Sequence[int]
+) -> None:
+    """Write matches (M, 2) of each pair (P, 2) of rows of images with these ids into a COLMAP database."""
     with pycolmap.Database.open(str(database)) as db:
         for (i, j), matched in zip(pairs.tolist(), matches, strict=True):
-            db.write_matches(i + 1, j + 1, matched)
+            db.write_matches(ids[i], ids[j], matched)
 
 
 def match_pairs(
@@ -205,10 +208,10 @@ def fill_database(database: Path, model: Any, stored: Iterable[Stored], kind: De
             db.write_camera(camera, use_camera_id=True)
         for rig in model.rigs.values():
             db.write_rig(rig, use_rig_id=True)
+        for frame in model.frames.values():
+            db.write_frame(frame, use_frame_id=True)
         for image_id, (pixels, descriptors) in zip(sorted(model.images), stored, strict=True):
-            image = model.images[image_id]
-            db.write_frame(image.frame, use_frame_id=True)
-            db.write_image(image, use_image_id=True)
+            db.write_image(model.images[image_id], use_image_id=True)
             db.write_keypoints(image_id, pixels)
             if not kind.in_bytes:
                 descriptors = descriptors.astype("<f4").view(np.uint8).reshape(len(descriptors), kind.columns)

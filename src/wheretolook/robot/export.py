@@ -172,7 +172,8 @@ def export_localizer(landmarks: Landmarks, ids: NDArray[np.int64], mean_scores: 
         text = path.read_text(encoding="utf-8").replace("from wheretolook.", f"from {PACKAGE}.")
         write_text(folder / path.relative_to(ROOT), text)
     write_text(folder / "__init__.py", f"from {PACKAGE}.robot.localizer import ImageSequence, RobotLocalizer\n")
-    copy_file(ROOT / "localization" / "confidence.json", folder / "localization" / "confidence.json")
+    for name in ("confidence.json", "missing.json"):
+        copy_file(ROOT / "localization" / name, folder / "localization" / name)
 
 
 def _path(module: str) -> Path | None:
@@ -275,6 +276,7 @@ def _description(trained: TrainedNetwork[SetNetwork], camera: PinholeCamera, acc
         "map_attributes": list(MAP_ATTRIBUTES),
         "most": MAX_LANDMARKS,
         "accuracy": list(accuracy),
+        "error_scale": trained.error_scale,
         "range": training_range.record(),
         "serves_camera": bool(training_range.contains(camera_quantities(camera)[None])[0]),
     }

@@ -40,6 +40,7 @@ from wheretolook.geometry.poses import (
 from wheretolook.geometry.similarity import Similarity
 from wheretolook.localization.config import LocalizerConfig
 from wheretolook.localization.estimation import PoseEstimator, SingleViewPoses
+from wheretolook.localization.missing import ExpectedLandmarks
 from wheretolook.localization.rig import IDENTITY, Look, PosePrior, checked_turns, matches_among
 from wheretolook.localization.rig_localization import (
     POSES_OF_A_VIEW,
@@ -117,7 +118,10 @@ class RobotLocalizer:
         self.camera = PinholeCamera(width, height, camera["fx"], camera["fy"], centre)
         with np.load(folder / "landmarks.npz", allow_pickle=False) as stored:
             points = stored["points"]
-            distance = stored["attributes"][:, about["map_attributes"].index("mapped_distance")]
+            attributes = stored["attributes"]
+            directions = stored["directions"]
+        distance = attributes[:, about["map_attributes"].index("mapped_distance")]
+        expected = ExpectedLandmarks.of(points, directions, attributes, about["map_attributes"])
         if "descriptors.npy" not in about["files"]:
             raise ValueError(f"{folder}: exported without descriptors. Export again with --localize.")
         descriptors = np.load(folder / "descriptors.npy", allow_pickle=False)
@@ -127,7 +131,7 @@ class RobotLocalizer:
         self._descriptors[:, : len(points)] = descriptors.T
         self._twins = descriptors if has_twins(self, descriptors, points) else None
         self._config = LocalizerConfig(method="hypotheses")
-        self._localizer = JointLocalizer(PoseEstimator(points, self._config), turn_noise_deg, check_turns=True)
+        self._localizer = JointLocalizer(PoseEstimator(points, self._config), turn_noise_deg, True, expected)
         self._points = points
         self._mapping_distance_m = np.exp(distance)
         self._mean_scores = np.load(folder / "mean_scores.npy", allow_pickle=False)

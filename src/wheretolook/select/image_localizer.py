@@ -16,7 +16,7 @@ from scipy.sparse import csr_array
 from tqdm.auto import tqdm
 
 from wheretolook.dataset.config import ACCURACY, CONTRADICTED, LOCALIZED, Accuracy, checked_accuracy
-from wheretolook.features.extractor import EXTRACTORS, KINDS, ExtractorConfig, Keypoints, kind_of, runnable_extractors
+from wheretolook.features.extractor import EXTRACTORS, KINDS, ExtractorConfig, Keypoints
 from wheretolook.features.matches import Matches
 from wheretolook.geometry.poses import Float
 from wheretolook.localization.config import LocalizerConfig
@@ -26,22 +26,13 @@ from wheretolook.localization.rig_localization import POSES_OF_A_VIEW, POSES_OF_
 from wheretolook.mapping.colmap_model import ModelArrays, observation_matrix
 from wheretolook.mapping.config import FrameOptions
 from wheretolook.mapping.feature_files import HDF5_SUFFIXES, weights_in_name
-from wheretolook.mapping.georeference import REPORT_FILE
 from wheretolook.mapping.landmarks import Landmarks
-from wheretolook.mapping.map import Map, find_features
+from wheretolook.mapping.map import Map, extractor_of, find_features
 from wheretolook.mapping.map_frame import MapFrame
 from wheretolook.select.localized import Localized
 from wheretolook.select.query_images import KnownCamera, QueryImage, QueryImages, distinct_names
-from wheretolook.utils.errors import (
-    ConfigError,
-    MapError,
-    MapWarning,
-    PoseError,
-    TableError,
-    WhereToLookError,
-    from_record,
-)
-from wheretolook.utils.files import path_ends, read_json_object, read_text
+from wheretolook.utils.errors import ConfigError, MapError, MapWarning, PoseError, TableError, WhereToLookError
+from wheretolook.utils.files import path_ends, read_text
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,7 +121,7 @@ class ImageLocalizer:
         assert opened.images is not None
         learned = not KINDS[landmarks.features].in_bytes
         features = database or (find_features(path) if lightglue or learned else None)
-        extractor = extractor or _extractor_of(path, landmarks)
+        extractor = extractor or extractor_of(path, KINDS[landmarks.features])
         of_images = None if pairs is None else ImagePairs.read(pairs, opened.images)
         result = cls(landmarks, opened.frame, QueryImages(opened), extractor, device, of_images, lightglue, features)
         _ = (
@@ -181,7 +172,7 @@ class ImageLocalizer:
     @cached_property
     def _rigs(self) -> JointLocalizer:
         # given rotations have a standard deviation of 0.2 degrees about each axis
-        return JointLocalizer(self._localizer.estimator, 0.2, check_turns=True)
+        return JointLocalizer(self._localizer.estimator, 0.2, True, self._localizer.expected)
 
     def localize(
         self,
@@ -316,19 +307,3 @@ class ImageLocalizer:
             problem = "the camera moved between the images, and the unit of the map is unknown"
             raise ConfigError(problem, value=f"{moved:.2g} m", fix="Give --scale.")
         return cam_from_rig * (1, 1, 1, 0)
-
-
-def _extractor_of(path: Path, landmarks: Landmarks) -> ExtractorConfig:
-    """Return the extractor in the report of a map of this project, or the first that gives descriptors of its kind."""
-    try:
-        stated: Any = read_json_object(path / REPORT_FILE)["config"]["extractor"]
-        recorded = from_record(ExtractorConfig, stated)
-        if kind_of(recorded.method).name == landmarks.features:  # not if the descriptors come from elsewhere
-            return recorded
-    except (OSError, ValueError, KeyError, TypeError):
-        pass
-    for name in runnable_extractors():
-        if kind_of(name).name == landmarks.features:
-            return ExtractorConfig(name)
-    problem = "no extractor for the descriptors of this map can be run here"
-    raise MapError(problem, path=path, value=landmarks.features, fix="Map with SIFT, ALIKED, DISK or XFeat.")

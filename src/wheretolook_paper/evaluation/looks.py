@@ -210,11 +210,13 @@ SET_COLUMNS = (
     "rival_own",
     "deviation_m",
     "deviation_deg",
+    "missing",
     "confidence",
     "seconds",
 )
 """Columns of `label_sets`. `status`, `error_m` and `error_deg` are as for single viewpoints, so `is_good` applies to sets,
-too; `elsewhere` is the rival support, `own` and `rival_own` are the unique support of pose and rival."""
+too; `elsewhere` is the rival support, `own` and `rival_own` are the unique support of pose and rival;
+`missing` is that of `JointLocalization`, NaN if nothing can be expected."""
 
 
 def label_sets(
@@ -282,6 +284,7 @@ def set_label(result: JointLocalization, true: Float) -> tuple[object, ...]:
         result.rival_support,
         *result.unique_support,
         *result.deviation,
+        np.nan if result.missing is None else result.missing,
         result.probability(),
     )
 

@@ -60,6 +60,29 @@ def fit(poses: pd.DataFrame) -> ConfidenceModel:
     return ConfidenceModel(weights, round(float(fitted.intercept_[0]), 4), tuple(errors))
 
 
+def fit_missing(model: ConfidenceModel, poses: pd.DataFrame, weight: Float) -> tuple[float, float, float]:
+    """Fit `ConfidenceModel.by_missing` to poses with a column "missing" and a weight each (B,)."""
+    log_odds = np.clip(model.log_odds(features_of(poses)), -7, 7)
+    missing = np.log(np.maximum(poses["missing"].to_numpy(), 0.02))
+    inputs = np.column_stack([log_odds, missing])
+    fitted = LogisticRegression(C=10, max_iter=3000).fit(inputs, is_within(poses, RIGHT_PLACE_LIMITS), weight)
+    slope, of_missing = fitted.coef_[0].round(3).tolist()
+    return slope, of_missing, round(float(fitted.intercept_[0]), 3)
+
+
+def scene_weights(poses: pd.DataFrame) -> Float:
+    """Return weights (B,) with which every kind of scene (its name up to "-") and in it every scene counts alike.
+
+    Buildings, most of whose rooms have an unmapped copy here, count half; poses that were not chosen a quarter.
+    """
+    scene = poses["scene"]
+    kind = scene.str.split("-").str[0]
+    n_scenes = kind.map(scene.groupby(kind).nunique())
+    rivals = np.where(poses["hypothesis"] == 0, 1.0, 0.25)
+    half = np.where(kind == "building", 0.5, 1.0)
+    return np.asarray(half * rivals / scene.map(scene.value_counts()) / n_scenes, dtype=np.float64)
+
+
 def predict(model: ConfidenceModel, poses: pd.DataFrame, accuracy: Accuracy) -> Float:
     """Predict the probabilities (B,) that poses are within an accuracy."""
     place = model.predict_proba(features_of(poses))
@@ -68,11 +91,13 @@ def predict(model: ConfidenceModel, poses: pd.DataFrame, accuracy: Accuracy) -> 
     return place * np.min(below, axis=0)
 
 
-def main(poses: tuple[Path, ...]) -> None:
+def main(poses: tuple[Path, ...], place: bool = True) -> None:
     """Fit the model, judge each scene by a fit on the others, and print the model.
 
     Args:
         poses: `results/relocalize/poses.parquet` of datasets of validation scenes.
+        place: fit everything; otherwise only what corrects the bundled model by what is missing, for which the poses
+            are of scenes that repeat, too.
     """
     table = pd.concat([pd.read_parquet(path) for path in poses], ignore_index=True)
     table = table[table["n_inliers"] >= MIN_INLIERS].reset_index(drop=True)
@@ -89,10 +114,14 @@ def main(poses: tuple[Path, ...]) -> None:
         )
         right = f"{good[sure].mean():.3f} of {sure.sum()} at 0.99" if sure.any() else "none at 0.99"
         print(f"{accuracy[0]} m, {accuracy[1]} degrees: {good.mean():.3f} right; {numbers}; right {right}")
-    model = fit(table)
+    model = fit(table) if place else ConfidenceModel.bundled()
     errors = {name: vars(error) for name, error in zip(("position", "orientation"), model.errors, strict=True)}
     weights = dict(zip(model.names, model.weights, strict=True))
-    print(json.dumps({"weights": weights, "bias": model.bias, "errors": errors}, indent=2))
+    by_missing = ConfidenceModel.bundled().by_missing
+    if "missing" in table and np.isfinite(table["missing"]).all():
+        by_missing = fit_missing(model, table, scene_weights(table))
+    missing = dict(zip(("slope", "weight", "bias"), by_missing, strict=True))
+    print(json.dumps({"weights": weights, "bias": model.bias, "errors": errors, "missing": missing}, indent=2))
 
 
 if __name__ == "__main__":

@@ -113,7 +113,7 @@ def map_known_poses(folder: Path, work: Path, extractor: ExtractorConfig, worker
         database.unlink(missing_ok=True)
         fill_database(database, model, stored, features.kind)
         found = match_pairs(stored, pairs, work, processes, kind=features.kind)
-        write_matches(database, pairs, found)
+        write_matches(database, pairs, found, sorted(model.images))
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = 0
     options = pycolmap.BundleAdjustmentOptions(print_summary=False)

@@ -60,7 +60,7 @@ class AccuracyModel(LogisticRegression):
     Methods take arrays, or tensors if `xp` is torch instead of NumPy.
     """
 
-    names = ("log_odds", "log_orientation_variance")
+    names: ClassVar[tuple[str, ...]] = ("log_odds", "log_orientation_variance")
     about = "the accuracy of views"
     file = Path(__file__).with_name("accuracy.json")
 

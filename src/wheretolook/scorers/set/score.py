@@ -7,7 +7,7 @@ from bisect import bisect_left
 from concurrent.futures import ThreadPoolExecutor
 from copy import copy, deepcopy
 from dataclasses import replace
-from math import log
+from math import exp, log
 from threading import Lock
 from typing import Self
 
@@ -27,6 +27,7 @@ from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.colmap_model import observation_matrix, select_points
 from wheretolook.mapping.landmarks import MAP_ATTRIBUTES
 from wheretolook.mapping.map import Map
+from wheretolook.mapping.track_errors import log_error_ratio
 from wheretolook.scorers.base import LandmarkProbabilities, Scorer
 from wheretolook.scorers.set.accuracy import model_of, probabilities, statistics_of
 from wheretolook.scorers.set.network import (
@@ -320,12 +321,17 @@ def for_map(trained: TrainedNetwork[SetNetwork], localization_map: LocalizationM
 
 
 def error_scale(localization_map: LocalizationMap) -> float:
-    """Return the scale of the errors of a map's poses: its keypoint noise in pixels.
+    """Return the scale of the errors of a map's poses: its keypoint noise in pixels, times a factor by its tracks.
 
-    At least a tenth of a pixel, less than that of SIFT: maps made from exact points have none.
+    The noise is at least a tenth of a pixel, less than that of SIFT: maps made from exact points have none. Of the log of
+    the factor, `log_error_ratio` over its mean of maps of photographs, 0.4 counts (docs/research/cameras.md).
     """
     whole = localization_map.map.whole or localization_map.map
-    return max(0.1, whole.landmarks.keypoint_noise_px)
+    if "error_scale" not in whole.computed:
+        noise_px = max(0.1, whole.landmarks.keypoint_noise_px)
+        ratio = None if whole.images is None else log_error_ratio(whole.images, whole.cameras, noise_px)
+        whole.computed["error_scale"] = noise_px * (1.0 if ratio is None else exp(0.4 * (ratio - 0.27)))
+    return float(whole.computed["error_scale"])
 
 
 def _known_offset(network: SetNetwork, localization_map: LocalizationMap) -> float:

@@ -1,0 +1,124 @@
+"""Estimate from the tracks of a map how much larger errors of poses are than independent keypoints make them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from wheretolook.geometry.camera import Camera
+from wheretolook.geometry.pose_information import bearing_numbers, information_matrices
+from wheretolook.geometry.poses import Float
+from wheretolook.mapping.colmap_model import ModelArrays, observation_matrix, select_points
+
+MIN_OBSERVED = 12  # landmarks that are left of those that an image observes
+
+
+def log_error_ratio(images: ModelArrays, cameras: Mapping[int, Camera], noise_px: float) -> float | None:
+    """Estimate the log of the errors of poses on a map over their expected deviation, by its tracks alone.
+
+    Blocks of a sixteenth and a quarter of the images, which share landmarks, are held out. The remaining landmarks are
+    triangulated again, and images of the blocks localized by their keypoints, in linear steps from where the whole map has
+    them, with Cauchy weights. Expected deviations are those of independent keypoint noise (pixels) in all images. Returns
+    the mean of the medians for positions and orientations; None if keypoints are unknown, or too few images can be tested.
+    """
+    if images.observation_pixels is None or len(images.image_ids) < 5 or not len(images.points):
+        return None
+    kept = np.zeros(len(images.points), dtype=bool)
+    kept[:: max(1, -(-len(kept) // 20_000))] = True  # evenly spread
+    images = select_points(images, kept)
+    observes = observation_matrix(images)
+    shared = np.asarray((observes @ observes.T).toarray())
+    tracks = _Tracks(images, cameras, noise_px)
+    logs = []
+    for first in np.linspace(0, len(shared) - 1, min(6, len(shared))).round().astype(int):
+        neighbours = np.argsort(-shared[first], kind="stable")
+        for part in (16, 4):
+            held_out = neighbours[: max(1, len(shared) // part)]
+            logs += tracks.log_ratios(held_out, neighbours[: 1 + min(2, len(held_out) - 1)])
+    return float(np.median(logs, axis=0).mean()) if len(logs) >= 3 else None
+
+
+class _Tracks:
+    """Rays of a map's observations (O), in the world, and their precisions in 1 / rad^2."""
+
+    def __init__(self, images: ModelArrays, cameras: Mapping[int, Camera], noise_px: float) -> None:
+        assert images.observation_pixels is not None
+        self.points = images.points
+        self.point = images.observation_point
+        self.image = images.observation_image
+        self.centers = images.image_centers
+        self.rays = np.empty((len(self.image), 3))
+        for row in range(len(images.image_ids)):
+            of_image = self.image == row
+            in_camera = cameras[int(images.image_cameras[row])].unproject(images.observation_pixels[of_image])
+            self.rays[of_image] = in_camera @ images.image_poses[row, :, :3]
+        self.precision = (images.image_focal_px[self.image] / noise_px) ** 2
+
+    def log_ratios(self, held_out: NDArray[np.integer], tested: NDArray[np.integer]) -> list[tuple[float, float]]:
+        """Return log errors over deviations of position and orientation, for each tested image that can be localized."""
+        rest = ~np.isin(self.image, held_out)
+        points, covariances, known = self._triangulated(rest)
+        found = []
+        for image in tested:
+            rows = np.flatnonzero((self.image == image) & known[self.point])
+            if len(rows) >= MIN_OBSERVED:
+                at = self.point[rows]
+                found.append(self._localized(rows, points[at] - self.centers[image], covariances[at]))
+        return [pair for pair in found if np.isfinite(pair).all()]
+
+    def _triangulated(self, rest: NDArray[np.bool_]) -> tuple[Float, Float, NDArray[np.bool_]]:
+        """Return points (P, 3), covariances (P, 3, 3), and which can be triangulated from some observations (O,)."""
+        n = len(self.points)
+        point = self.point[rest]
+        offsets = self.points[point] - self.centers[self.image[rest]]
+        distance = np.linalg.norm(offsets, axis=1)
+        bearings = offsets / distance[:, None]
+        across = np.eye(3) - bearings[:, :, None] * bearings[:, None]
+        off = np.einsum("oij,oj->oi", across, self.rays[rest])
+        spread = 1 - np.linalg.norm(_sums(bearings, point, n), axis=1) / np.maximum(np.bincount(point, minlength=n), 1)
+        known = (np.bincount(point, minlength=n) >= 2) & (spread > np.radians(0.75) ** 2 / 2)  # rays 1.5 degrees apart
+        step = np.zeros((n, 3))
+        covariance = np.zeros((n, 3, 3))
+        for _ in range(3):
+            residual = off - np.einsum("oij,oj->oi", across, step[point]) / distance[:, None]
+            weight = self.precision[rest] / (1 + (residual**2).sum(1) * self.precision[rest] / 4)
+            normal = _sums((across * (weight / distance**2)[:, None, None]).reshape(-1, 9), point, n).reshape(-1, 3, 3)
+            right = _sums(off * (weight / distance)[:, None], point, n)
+            covariance[known] = np.linalg.inv(normal[known])
+            step = np.einsum("pij,pj->pi", covariance, right)
+        return self.points + step, covariance, known
+
+    def _localized(self, rows: NDArray[np.integer], offsets: Float, covariances: Float) -> tuple[float, float]:
+        """Return log errors over deviations of position and orientation of an image with observations `rows`.
+
+        Its landmarks (M) are at offsets (M, 3) from the camera, and have covariances (M, 3, 3).
+        """
+        distance = np.linalg.norm(offsets, axis=1)
+        bearings = offsets / distance[:, None]
+        rays = self.rays[rows]
+        off = rays - (rays * bearings).sum(1)[:, None] * bearings
+        along = np.einsum("mi,mij,mj->m", bearings, covariances, bearings)
+        variance = (np.trace(covariances, axis1=1, axis2=2) - along) / (2 * distance**2)
+        precision = 1 / (1 / self.precision[rows] + variance)
+        numbers = bearing_numbers(offsets)
+        step = np.zeros(6)
+        for _ in range(5):
+            moved = step[:3] - (bearings @ step[:3])[:, None] * bearings
+            residual = off + moved / distance[:, None] + np.cross(step[3:], bearings)
+            weight = precision / (1 + (residual**2).sum(1) * precision / 4)
+            information = information_matrices(weight @ numbers)
+            right = np.concatenate([(off / distance[:, None]).T @ weight, np.cross(bearings, off).T @ weight])
+            covariance = np.linalg.pinv(information)
+            step = -covariance @ right
+        variances = np.diag(covariance)
+        position, orientation = (
+            np.log(np.linalg.norm(step[part]) / np.sqrt(variances[part].sum())) for part in (slice(3), slice(3, 6))
+        )
+        return float(position), float(orientation)
+
+
+def _sums(values: Float, groups: NDArray[np.integer], n: int) -> Float:
+    """Sum values (O, K) over groups (O,), (n, K)."""
+    return np.stack([np.bincount(groups, weights=column, minlength=n) for column in values.T], axis=1)

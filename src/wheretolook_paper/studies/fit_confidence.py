@@ -71,7 +71,7 @@ def fit_missing(model: ConfidenceModel, poses: pd.DataFrame, weight: Float) -> t
 
 
 def scene_weights(poses: pd.DataFrame) -> Float:
-    """Return weights (B,) with which every kind of scene (its name up to "-") and in it every scene counts alike.
+    """Return weights (B,), one in the mean, with which every kind of scene (its name up to "-") and in it every scene counts alike.
 
     Buildings, most of whose rooms have an unmapped copy here, count half; poses that were not chosen a quarter.
     """
@@ -80,7 +80,8 @@ def scene_weights(poses: pd.DataFrame) -> Float:
     n_scenes = kind.map(scene.groupby(kind).nunique())
     rivals = np.where(poses["hypothesis"] == 0, 1.0, 0.25)
     half = np.where(kind == "building", 0.5, 1.0)
-    return np.asarray(half * rivals / scene.map(scene.value_counts()) / n_scenes, dtype=np.float64)
+    weight = np.asarray(half * rivals / scene.map(scene.value_counts()) / n_scenes, dtype=np.float64)
+    return np.asarray(weight / weight.mean())
 
 
 def predict(model: ConfidenceModel, poses: pd.DataFrame, accuracy: Accuracy) -> Float:

@@ -79,7 +79,9 @@ class Surface:
         landmarks = self.localization_map.landmarks
         views: list[NDArray[np.int64]] = []
         rows: list[NDArray[np.int32]] = []
-        for view, visible in enumerate(self.localization_map.landmarks_in_view(cam_from_world)):
+        sets = self.localization_map.landmarks_in_view(cam_from_world)
+        for view in range(len(sets)):
+            visible = sets[view]
             share = pixels_of(camera, transform(cam_from_world[view], landmarks.points[visible]))
             share /= (camera.width, camera.height)
             column, row = np.clip((share * (across, down)).astype(np.int64), 0, (across - 1, down - 1)).T

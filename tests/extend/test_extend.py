@@ -1,6 +1,7 @@
 """Photographs are planned where a room is not mapped, in pairs that register; audits find where and why views fail."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
@@ -17,12 +18,14 @@ from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import camera_centers, poses_looking_along
 from wheretolook.geometry.views import Views
 from wheretolook.inputs.localization_map import LocalizationMap
+from wheretolook.mapping.colmap_model import colmap_poses
+from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.scenes.loading import save_glb
 from wheretolook.scorers.base import CountingScorer
 from wheretolook.select.where_to_look import WhereToLook
 from wheretolook.space.free_space import FreeSpace
 from wheretolook.space.mapped_space import MappedSpace
-from wheretolook.utils.errors import ConfigError, MapError, TableError
+from wheretolook.utils.errors import ConfigError, MapError, MapWarning, SceneError, TableError
 from wheretolook.visibility.occlusion import MeshOcclusion
 
 SIZE = (8.0, 5.0, 3.0)
@@ -102,11 +105,23 @@ def test_gains_fall_where_all_photographs_register(half_mapped):
     assert (np.diff(gain) < 0).all()
 
 
-def test_a_list_ends_at_the_share_asked_for_and_an_odd_one_with_a_single_photograph(half_mapped):
+def test_a_list_ends_at_the_share_asked_for_and_an_odd_one_with_a_single_photograph(half_mapped, tmp_path):
     long = planner_of(*half_mapped).plan(5)
     assert len(long.views) == 5 and long.views.partner[-1] == ""
     until = float(long.views.share[1])
     assert len(planner_of(*half_mapped).plan(5, until=until).views) == 2
+    reached = planner_of(*half_mapped).plan(5, until=0.001)
+    assert len(reached.views) == 0
+    np.testing.assert_allclose(reached.predicted, reached.targets.score)
+    reached.views.save(tmp_path / "none.csv")
+
+
+def test_candidates_that_are_mapping_images_are_left_out(half_mapped):
+    scorer, space = half_mapped
+    poses = scorer.localization_map.mapping_poses.astype(float)
+    targets = Views(poses, CAMERA, "set", scorer.localization_map.frame, waypoint=np.arange(9), score=np.full(9, 0.5))
+    with pytest.raises(SceneError, match="in the map"):
+        Planner(scorer, space, targets, poses)
 
 
 def test_a_map_in_which_nothing_registers_is_an_error_with_a_place(half_mapped):
@@ -115,6 +130,21 @@ def test_a_map_in_which_nothing_registers_is_an_error_with_a_place(half_mapped):
     planner.scores = np.full(len(planner.candidates), 0.1)
     with pytest.raises(MapError, match=r"registers.*Photograph around"):
         planner.plan(4)
+
+
+def test_a_map_in_parts_is_stated(half_mapped):
+    scorer, space = half_mapped
+    known = scorer.localization_map.map
+    alone = known.images.observation_image != 0  # the first image keeps no landmark
+    of_point = np.bincount(known.images.observation_point[alone], minlength=len(known.images.points))
+    images = replace(
+        known.images,
+        observation_start=np.concatenate([[0], np.cumsum(of_point)]),
+        observation_image=known.images.observation_image[alone],
+        observation_keypoint=known.images.observation_keypoint[alone],
+    )
+    with pytest.warns(MapWarning, match=r"1 of 9 images share no landmarks.*000\.jpg"):
+        planner_of(CountScorer(replace(scorer.localization_map, map=replace(known, images=images))), space)
 
 
 def test_an_image_covers_what_it_sees_from_a_similar_direction_and_distance(half_mapped):
@@ -198,6 +228,15 @@ def test_an_audit_has_the_mean_score_of_the_views_and_their_weak_regions(look):
     np.testing.assert_array_equal(places["region"] > 0, weak)
     assert (places.loc[weak, "cause"] != "").all()
     assert look.audit(audit).share == pytest.approx(audit.share)
+
+
+def test_depth_images_are_the_surface(room, tmp_path):
+    poses = colmap_poses(room[0])
+    depths = WarpRenderer(box_room((6.0, 5.0, 3.0))).render(PinholeCamera(160, 120, 80.0), poses).depth_m
+    for row, depth in enumerate(depths):
+        np.save(tmp_path / f"{row:03}.npy", depth)
+    look = WhereToLook.from_colmap(room[0], weights=WEIGHTS, depth=tmp_path, device="cpu")
+    assert look.extend(2, views=40, least_p=0).surface == "depth images"
 
 
 @pytest.mark.parametrize(

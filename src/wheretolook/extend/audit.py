@@ -59,7 +59,7 @@ class Audit:
         table["region"] = 0
         table["cause"] = ""
         weak = np.flatnonzero(table["share"] < 0.5)
-        usual = table["n_visible"].drop(index=rows[weak]).median() if len(weak) < len(table) else 200.0
+        usual = table.loc[table["share"] >= 0.5, "n_visible"].median() if len(weak) < len(table) else 200.0
         if len(weak):
             tree = cKDTree(positions[weak] * views.frame.world_from_map.scale)
             near = tree.sparse_distance_matrix(tree, 1.6 * self.apart_m)
@@ -105,7 +105,8 @@ def _cause(places: pd.DataFrame, usual: float) -> str:
 def compare_mounts(audit: Callable[..., Audit], options: TargetOptions) -> pd.DataFrame:
     """Audit each height and pitch of the options, by a function that takes them, for a fixed camera: a row of each."""
     rows = []
-    for heights in [(height,) for height in options.height_m] or [()]:
+    each: list[tuple[float, ...]] = [(height,) for height in options.height_m]
+    for heights in each or [()]:
         for pitch in pitches_within(options.pitch_deg).tolist():
             done = audit(height_m=heights, pitch_deg=(pitch, pitch))
             low, high = done.interval

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -10,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.sparse import csr_array, vstack
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from scipy.special import expit, log_expit
 
@@ -19,7 +21,7 @@ from wheretolook.geometry.poses import Float, camera_centers
 from wheretolook.geometry.views import Views
 from wheretolook.mapping.colmap_model import observation_matrix
 from wheretolook.scorers.base import Scorer
-from wheretolook.utils.errors import MapError
+from wheretolook.utils.errors import MapError, MapWarning, SceneError
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,8 +72,12 @@ class Planner:
         self.targets = targets
         self.surface = Surface(scorer.localization_map, space)
         self.images, self.cameras = mapping_views(scorer.localization_map)
+        self._warn_of_parts()
         self.candidates = candidates[~self._taken(candidates)]
         n = len(self.candidates)
+        if n == 0:
+            fix = "Widen --height or --pitch."
+            raise SceneError("all photographs that can be taken are in the map", value=len(candidates), fix=fix)
         self.camera = scorer.localization_map.camera
         to_world = scorer.localization_map.frame.world_from_map
         self.patches = self.surface.patches(to_world.apply_to_poses(targets.cam_from_world), 10, 8)
@@ -219,6 +225,20 @@ class Planner:
             views, waypoint_id=ids, rank=np.ones(len(rows), dtype=np.int64), score=self.scores[rows], **columns
         )
         return views.in_frame(self.scorer.localization_map.frame)
+
+    def _warn_of_parts(self) -> None:
+        """Issue a `MapWarning` if images share no landmarks with the others, directly or through others."""
+        images = self.scorer.localization_map.map.images
+        if images is None:
+            return
+        observes = observation_matrix(images)
+        part = connected_components(observes @ observes.T, directed=False)[1]
+        apart = np.flatnonzero(part != np.bincount(part).argmax())
+        if len(apart):
+            names = ", ".join(images.image_names[row] for row in apart[:3])
+            text = f"{len(apart)} of {len(part)} images share no landmarks with the largest part of the map, such as {names}"
+            fix = "bridge them with photographs that overlap both, or check that their poses are in one frame"
+            warnings.warn(f"{self.scorer.localization_map.map.path}: {text}; {fix}", MapWarning, stacklevel=3)
 
     def _overlaps(self, row: int, earlier: list[int]) -> str:
         """Return the names of up to five images, the photographs before included, that show most of what a candidate does."""

@@ -65,9 +65,10 @@ def mount_figure(mounts: pd.DataFrame) -> Figure:
     with context(RC):
         figure = new_figure(5.5, 3.8)
         plan = figure.add_subplot()
-        for number, (height, rows) in enumerate(mounts.groupby("height_m", dropna=False)):
+        for number, (_, rows) in enumerate(mounts.groupby("height_m", dropna=False)):
             color = (BLUE, VERMILION, INK, GREY)[number % 4]
-            label = "height of the cameras" if height != height else f"{height:g} m"
+            of_cameras = rows["height_m"].isna().any()
+            label = "that of the cameras" if of_cameras else f"{rows['height_m'].iloc[0]:g} m"
             errors = np.abs(rows[["share_low", "share_high"]].to_numpy().T - rows["share"].to_numpy())
             plan.errorbar(rows["pitch_deg"], rows["share"], errors, color=color, marker="o", capsize=3, label=label)
         plan.set(xlabel="pitch (degrees)", ylabel="share of target views that localize", ylim=(0, 1))

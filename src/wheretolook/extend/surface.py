@@ -77,16 +77,20 @@ class Surface:
         """Return views and landmarks (P,) of the cells of images in which there are any."""
         camera = self.localization_map.camera
         landmarks = self.localization_map.landmarks
+        views: list[NDArray[np.int64]] = []
+        rows: list[NDArray[np.int32]] = []
         sets = self.localization_map.landmarks_in_view(cam_from_world)
-        view = np.repeat(np.arange(len(sets)), np.diff(sets.starts))
-        pose = cam_from_world[view]
-        in_camera = np.einsum("pij,pj->pi", pose[:, :, :3], landmarks.points[sets.indices]) + pose[:, :, 3]
-        share = pixels_of(camera, in_camera) / (camera.width, camera.height)
-        column, row = np.clip((share * (across, down)).astype(np.int64), 0, (across - 1, down - 1)).T
-        cell = (view * down + row) * across + column
-        order = np.lexsort((-landmarks.track_length[sets.indices], cell))
-        first = order[np.unique(cell[order], return_index=True)[1]]
-        return view[first], sets.indices[first].astype(np.int64)
+        for view in range(len(sets)):
+            visible = sets[view]
+            share = pixels_of(camera, transform(cam_from_world[view], landmarks.points[visible]))
+            share /= (camera.width, camera.height)
+            column, row = np.clip((share * (across, down)).astype(np.int64), 0, (across - 1, down - 1)).T
+            cell = row * across + column
+            order = np.lexsort((-landmarks.track_length[visible], cell))
+            first = order[np.unique(cell[order], return_index=True)[1]]
+            views.append(np.full(len(first), view))
+            rows.append(visible[first])
+        return np.concatenate(views), np.concatenate(rows).astype(np.int64)
 
     def covering(self, patches: Patches, cam_from_world: Float, cameras: Sequence[Camera]) -> csr_array:
         """Return which images (I, 3, 4) of cameras (I,) show which patches so that a landmark there would be matched.

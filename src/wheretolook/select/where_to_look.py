@@ -349,8 +349,8 @@ class WhereToLook:
         request = TargetOptions(**options)
         to_world = self.frame.world_from_map
         if isinstance(at, Audit):
-            poses = to_world.apply_to_poses(at.views.cam_from_world)
-            return replace(at, views=self._target_views(poses, at.views.waypoint, at.views.waypoint_id))
+            again = to_world.apply_to_poses(at.views.cam_from_world)
+            return replace(at, views=self._target_views(again, at.views.waypoint, at.views.waypoint_id))
         heading = None
         apart_m = 1.0
         if at is None:

@@ -46,6 +46,7 @@ def map_at(scene: Scene, poses: Float, folder: Path, seed: int = 0) -> Path:
     """Map a scene's renders at poses (I, 3, 4) that stay as they are; an existing folder is kept."""
     if folder.is_dir():
         return folder
+    assert isinstance(scene.camera, PinholeCamera)
     config = MapConfig(n_images=len(poses))
     with replacing_map(config, folder, seed, 1, "cpu", False) as (partial, run):
         depth: list[NDArray[np.float32]] = []
@@ -144,8 +145,7 @@ def main(
     walks = {size: plan_walk(space, scene.mesh.bounds, size, seed) for size in (images, images + n)}
     poses = {size: poses_looking_along(walk.positions, walk.directions) for size, walk in walks.items()}
     base = map_at(scene, poses[images], work / name / "none", seed)
-    given = {"mesh": mesh} if surface == "mesh" else {}
-    look = WhereToLook.from_colmap(base, device=device, **given)
+    look = WhereToLook.from_colmap(base, device=device, mesh=mesh if surface == "mesh" else None)
     height_m = float(np.nanmedian(walks[images].positions[:, 2] - space.floor_below(walks[images].positions)))
     places, _ = camera_places(space, walks[images].positions, height_m, 300)
     # other views than those of the plan
@@ -169,7 +169,7 @@ def main(
         whole = poses[images + n] if policy == "walk" else np.concatenate([poses[images], added])
         folder = work / name / (policy if policy in ("none", "walk", "random", "farthest") else f"{policy}-{surface}")
         errors = localized(scene, map_at(scene, whole, folder, seed), tests)
-        good[policy] = (errors <= (0.05, 0.4)).all(axis=1)
+        good[policy] = np.asarray((errors[:, 0] <= 0.05) & (errors[:, 1] <= 0.4))
         lost, won = (int((good["none"] & ~good[policy]).sum()), int((good[policy] & ~good["none"]).sum()))
         record = {"scene": name, "surface": surface, "policy": policy, "added": len(whole) - images}
         record |= {"good": good[policy].mean(), "coarse": (errors <= (0.25, 2.0)).all(axis=1).mean()}

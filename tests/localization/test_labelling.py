@@ -246,6 +246,7 @@ def test_labels_are_the_same_with_and_without(views, matched, expected, tmp_path
 def test_shards_with_and_without_matches_have_names_of_their_own(room, tmp_path):
     """Shards without matches have the names and the manifest of versions that could not store matches."""
     table = pd.concat([facing(POSTER, 3, 1.5), facing(PLAIN, 1, 1.1)], ignore_index=True)
+    table["viewpoint_id"] = np.arange(len(table))
     shards = tmp_path / "shards"
     label(table, room, shards, shard_size=4)
     (without,) = times(shards)

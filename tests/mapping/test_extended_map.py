@@ -119,6 +119,13 @@ def test_invalid_inputs_write_nothing(folders, tmp_path, map_files, new, error):
     assert sorted(tmp_path.rglob("*")) == before
 
 
+def test_the_map_itself_is_not_replaced(folders):
+    new = PhotographsConfig(folders / "new")
+    for out in (folders / "map", folders):
+        with pytest.raises(ConfigError, match="replace the map"):
+            extend_map(folders / "map", new, out, progress=False)
+
+
 def test_without_features_or_photographs_nothing_can_be_matched(folders, tmp_path):
     shutil.copytree(folders / "map", tmp_path / "room")
     (tmp_path / "room" / "report.json").unlink()

@@ -67,5 +67,17 @@ def test_it_is_unknown_without_keypoints_or_with_few_images():
     images = observed(0.3)
     assert log_error_ratio(replace(images, observation_pixels=None), {1: CAMERA}, 0.3) is None
     assert log_error_ratio(observed(0.3, n_images=4), {1: CAMERA}, 0.3) is None
+    assert log_error_ratio(images, {}, 0.3) is None
     one_center = replace(images, image_centers=np.tile(images.image_centers[:1], (len(images.image_ids), 1)))
     assert log_error_ratio(one_center, {1: CAMERA}, 0.3) is None  # nothing can be triangulated
+
+
+def test_keypoints_without_a_ray_are_left_out_and_exact_ones_are_bounded():
+    images = observed(0.3)
+    pixels = images.observation_pixels.copy()
+    pixels[::50] = np.nan
+    expected = log_error_ratio(images, {1: CAMERA}, 0.3)
+    assert log_error_ratio(replace(images, observation_pixels=pixels), {1: CAMERA}, 0.3) == pytest.approx(
+        expected, abs=0.2
+    )
+    assert log_error_ratio(observed(1e-9), {1: CAMERA}, 0.3) == -0.5

@@ -269,7 +269,7 @@ def _extend(options: BuildMap, scene: SceneFolder, log: Log) -> BuildMap:
         log(f"{scene.name}: {placed}; {landmarks} -> {extended}")
         for name, reason in report.unplaced.items():
             log(f"{scene.name}: not placed: {name}: {reason}")
-    number = options.camera_id or _most_used_camera(read_model(extended))
+    number = _most_used_camera(read_model(extended)) if options.camera_id is None else options.camera_id
     result = replace(options, extend=None, model=extended, database=database, camera_id=number)
     return replace(result, photographs=PhotographsConfig(), scene=scene.name)
 

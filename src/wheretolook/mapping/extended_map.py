@@ -82,6 +82,9 @@ def extend_map(
         config = replace(config, extractor=extractor_of(map_dir, kind))
     largest = max(max(camera.width, camera.height) for camera in model.cameras.values())
     turned = reads_upright(map_dir)
+    out, old = Path(out_dir).resolve(), map_dir.resolve()
+    if out == old or out in old.parents:
+        raise ConfigError("the extended map would replace the map", path=out_dir, fix="Give another folder.")
     with replacing_map(config, out_dir, seed, workers, device, progress) as (folder, run):
         with temporary_folder(parent=folder) as work, run.clock("extract"):
             if photographs is not None:

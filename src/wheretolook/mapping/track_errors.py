@@ -19,25 +19,29 @@ def log_error_ratio(images: ModelArrays, cameras: Mapping[int, Camera], noise_px
     """Estimate the log of the errors of poses on a map over their expected deviation, by its tracks alone.
 
     Blocks of a sixteenth and a quarter of the images, which share landmarks, are held out. The remaining landmarks are
-    triangulated again, and images of the blocks localized by their keypoints, in linear steps from where the whole map has
-    them, with Cauchy weights. Expected deviations are those of independent keypoint noise (pixels) in all images. Returns
-    the mean of the medians for positions and orientations; None if keypoints are unknown, or too few images can be tested.
+    triangulated again, and images of the blocks localized by their keypoints, by Gauss-Newton steps from their poses in
+    the whole map, with Cauchy weights. Expected deviations are those of independent keypoint noise (pixels) in all images.
+    Returns the mean of the medians for positions and orientations, within the range of the maps that it was measured on;
+    None if keypoints or cameras are unknown, or too few images can be tested.
     """
-    if images.observation_pixels is None or len(images.image_ids) < 5 or not len(images.points):
+    known = set(np.unique(images.image_cameras).tolist()) <= cameras.keys()
+    n = len(images.image_ids)
+    if images.observation_pixels is None or not known or n < 5 or not len(images.points):
         return None
-    kept = np.zeros(len(images.points), dtype=bool)
-    kept[:: max(1, -(-len(kept) // 20_000))] = True  # evenly spread
-    images = select_points(images, kept)
     observes = observation_matrix(images)
-    shared = np.asarray((observes @ observes.T).toarray())
-    tracks = _Tracks(images, cameras, noise_px)
-    logs = []
-    for first in np.linspace(0, len(shared) - 1, min(6, len(shared))).round().astype(int):
-        neighbours = np.argsort(-shared[first], kind="stable")
-        for part in (16, 4):
-            held_out = neighbours[: max(1, len(shared) // part)]
-            logs += tracks.log_ratios(held_out, neighbours[: 1 + min(2, len(held_out) - 1)])
-    return float(np.median(logs, axis=0).mean()) if len(logs) >= 3 else None
+    firsts = np.linspace(0, n - 1, min(6, n)).round().astype(int)
+    shared = np.asarray((observes[firsts] @ observes.T).toarray())
+    blocks = [
+        (neighbours[: max(1, n // part)], neighbours[: 3 if n // part >= 3 else 1])
+        for neighbours in np.argsort(-shared, axis=1, kind="stable")
+        for part in (16, 4)
+    ]
+    # all landmarks of the tested images, whose common errors do not average out, and no others
+    tested = np.unique(np.concatenate([rows for _, rows in blocks]))
+    seen = np.asarray(observes[tested].sum(0)).reshape(-1) > 0
+    tracks = _Tracks(select_points(images, seen), cameras, noise_px)
+    logs = [pair for block in blocks for pair in tracks.log_ratios(*block)]
+    return float(np.clip(np.median(logs, axis=0).mean(), -0.5, 2.0)) if len(logs) >= 3 else None
 
 
 class _Tracks:
@@ -54,15 +58,16 @@ class _Tracks:
             of_image = self.image == row
             in_camera = cameras[int(images.image_cameras[row])].unproject(images.observation_pixels[of_image])
             self.rays[of_image] = in_camera @ images.image_poses[row, :, :3]
+        self.known = np.isfinite(self.rays).all(1)  # some camera models have no ray of some pixels
         self.precision = (images.image_focal_px[self.image] / noise_px) ** 2
 
     def log_ratios(self, held_out: NDArray[np.integer], tested: NDArray[np.integer]) -> list[tuple[float, float]]:
         """Return log errors over deviations of position and orientation, for each tested image that can be localized."""
-        rest = ~np.isin(self.image, held_out)
+        rest = self.known & ~np.isin(self.image, held_out)
         points, covariances, known = self._triangulated(rest)
         found = []
         for image in tested:
-            rows = np.flatnonzero((self.image == image) & known[self.point])
+            rows = np.flatnonzero((self.image == image) & self.known & known[self.point])
             if len(rows) >= MIN_OBSERVED:
                 at = self.point[rows]
                 found.append(self._localized(rows, points[at] - self.centers[image], covariances[at]))

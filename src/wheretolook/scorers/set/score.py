@@ -462,6 +462,7 @@ class SetScorer(LandmarkScorer):
             expected_inliers[rows] = views.sums[:, 0].cpu().numpy()
             errors[rows] = model_of(self.trained).expected_errors(statistics_of(self.trained, views))
             n_visible[rows] = visible.cpu().numpy()
+            errors[rows][n_visible[rows] == 0] = np.nan  # the prior alone
             in_range[rows] &= self._in_range(described, visible)
             out_of_range[rows] = self.training_range.texts(view_quantities(described, visible, self._of_camera))
         out_of_range[~in_range & (out_of_range == "")] = "triangulation angles of the landmarks"

@@ -15,13 +15,16 @@ from wheretolook.extend.places import camera_places, drawn_views, pitches_within
 from wheretolook.extend.plan import Planner, fit_coverage
 from wheretolook.extend.surface import Patches, Surface
 from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.geometry.lattices import VoxelGrid
 from wheretolook.geometry.poses import camera_centers, poses_looking_along
 from wheretolook.geometry.views import Views
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.colmap_model import colmap_poses
+from wheretolook.planning.scene_map import build_viewpoint_map
 from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.scenes.loading import save_glb
 from wheretolook.scorers.base import CountingScorer
+from wheretolook.select.waypoints import given_waypoints
 from wheretolook.select.where_to_look import WhereToLook
 from wheretolook.space.free_space import FreeSpace
 from wheretolook.space.mapped_space import MappedSpace
@@ -228,6 +231,14 @@ def test_an_audit_has_the_mean_score_of_the_views_and_their_weak_regions(look):
     np.testing.assert_array_equal(places["region"] > 0, weak)
     assert (places.loc[weak, "cause"] != "").all()
     assert look.audit(audit).share == pytest.approx(audit.share)
+
+
+def test_targets_are_those_of_a_viewpoint_map(look, tmp_path):
+    grid = VoxelGrid((1.5, 1.5, 1.2), (3.5, 2.5, 1.8), (2, 1, 1))
+    build_viewpoint_map(look.scorer, grid, [0, 1], np.eye(3)[:2]).save(tmp_path / "viewpoints")
+    waypoints = given_waypoints([str(tmp_path / "viewpoints")])
+    np.testing.assert_allclose(waypoints.points, [(2, 2, 1.5), (3, 2, 1.5)])
+    assert len({*look.audit(waypoints, views=10).views.waypoint}) == 2
 
 
 def test_depth_images_are_the_surface(room, tmp_path):

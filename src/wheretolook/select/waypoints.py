@@ -129,7 +129,14 @@ def read_waypoints(path: str | Path, frame: str | None = None) -> Waypoints:
 
 
 def given_waypoints(texts: Sequence[str], frame: str | None = None) -> Waypoints:
-    """Return the waypoints of texts "x,y,z", or of one that names a file. Raises as `read_waypoints` and `parse_points`."""
+    """Return the waypoints of texts "x,y,z", or of one that names a file or the folder of a viewpoint map.
+
+    Raises as `read_waypoints`, `parse_points` and `ViewpointMap.load`.
+    """
+    if len(texts) == 1 and (Path(texts[0].strip()) / "viewpoint_map.json").is_file():
+        from wheretolook.planning.viewpoint_map import ViewpointMap
+
+        return Waypoints.of(ViewpointMap.load(texts[0].strip()).locations)
     if len(texts) == 1 and (Path(texts[0].strip()).exists() or texts[0].count(",") != 2):
         return read_waypoints(texts[0].strip(), frame)
     return parse_points(texts)

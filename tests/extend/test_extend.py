@@ -11,8 +11,10 @@ from box_scenes import box_room
 from colmap_models import colmap_model
 from selection.room import WEIGHTS, write_room
 from wheretolook.cli import main
-from wheretolook.extend.places import camera_places, drawn_views, pitches_within, views_around
+from wheretolook.extend.audit import Audit
+from wheretolook.extend.places import camera_places, drawn_views, photograph_places, pitches_within, views_around
 from wheretolook.extend.plan import Planner, fit_coverage
+from wheretolook.extend.report import percent
 from wheretolook.extend.surface import Patches, Surface
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.lattices import VoxelGrid
@@ -42,6 +44,13 @@ class CountScorer(CountingScorer):
 
     def score_counts(self, n_visible, n_filled):
         return np.minimum(n_visible / 100, 1.0)
+
+
+class AccurateScorer(CountScorer):
+    def at_accuracy(self, accuracy):
+        scorer = CountScorer(self.localization_map)
+        scorer.score = lambda poses: np.full(len(poses), accuracy[0])
+        return scorer
 
 
 @pytest.fixture(scope="module")
@@ -117,6 +126,55 @@ def test_a_list_ends_at_the_share_asked_for_and_an_odd_one_with_a_single_photogr
     assert len(reached.views) == 0
     np.testing.assert_allclose(reached.predicted, reached.targets.score)
     reached.views.save(tmp_path / "none.csv")
+
+
+def test_large_places_have_pairs(half_mapped):
+    scorer, _ = half_mapped
+    space = FreeSpace(box_room((34.0, 34.0, 3.0)))
+    places = photograph_places(scorer.localization_map, space, (), 300)
+    assert 200 < len(places) <= 350 and space.is_free(places).all()
+    candidates, rows = views_around(places, 8, np.zeros(1))
+    planner = planner_of(scorer, half_mapped[1])
+    planner.candidates = candidates
+    assert {*rows[planner.pairs].ravel()} == {*range(len(places))}
+    planner.pairs = planner.pairs[:0]
+    with pytest.raises(SceneError, match=r"0\.35 to 1\.4 m.*--n 1"):
+        planner.plan(2)
+
+
+def test_photographs_register_at_the_right_place(half_mapped):
+    planner = planner_of(AccurateScorer(half_mapped[0].localization_map), half_mapped[1])
+    np.testing.assert_allclose(planner.registers(), 0.5)
+    views = planner.plan(2).views
+    np.testing.assert_allclose(views.score, half_mapped[0].score(views.cam_from_world))
+
+
+@pytest.mark.parametrize(
+    ("counts", "cause"),
+    [
+        ((0, 0, 0, 0), "nothing mapped"),
+        ((10, 0, 0, 0), "nothing mapped"),
+        ((50, 5, 5, 5), "few landmarks"),
+        ((50, 30, 20, 10), "too far"),
+        ((50, 10, 30, 20), "too oblique"),
+        ((50, 10, 20, 30), "repeated"),
+    ],
+)
+def test_weak_regions_have_a_cause(half_mapped, counts, cause):
+    # a strong place with 100 landmarks, two weak neighbours at different heights, a weak place of another storey
+    centers = np.array([(0.0, 0, 1), (9, 0, 1), (10, 0, 2), (9, 0, 4)])
+    columns = dict(zip(("n_visible", "n_too_far", "n_too_oblique", "n_repeated"), counts, strict=True))
+    columns = {name: np.array([100 * (name == "n_visible"), *[count] * 3]) for name, count in columns.items()}
+    poses = poses_looking_along(centers, (1.0, 0.0, 0.0))
+    frame = half_mapped[0].localization_map.frame
+    score = np.array([1.0, 0, 0, 0])
+    views = Views(poses, CAMERA, "set", frame, waypoint=np.arange(4), score=score, **columns)
+    places = Audit(replace(views, waypoint_id=tuple("abcd")), 1.0).places()
+    assert places["region"].tolist() == [0, 1, 1, 2] and places["cause"].tolist() == ["", cause, cause, cause]
+
+
+def test_one_place_has_no_interval():
+    assert percent(0.5, np.nan, np.nan) == "50.0 %"
 
 
 def test_candidates_that_are_mapping_images_are_left_out(half_mapped):
@@ -201,8 +259,11 @@ def test_places_are_above_the_floor_at_the_height(half_mapped):
     np.testing.assert_allclose(camera_places(space, np.array([[2.0, 2.5, 1.2]]), None, 40)[0][:, 2], 1.2, atol=0.01)
     np.testing.assert_allclose(pitches_within((-30, 30)), [-30, -10, 10, 30])
     poses, rows = drawn_views(places, 80, np.array([10.0]), np.full(len(places), 90.0), (-5, 5), 0)
+    assert len(poses) == 80
     yaw = np.degrees(np.arctan2(poses[:, 2, 1], poses[:, 2, 0]))
     assert (np.abs(yaw - 90) <= 5).all() and {*rows} == {*range(len(places))}
+    few = drawn_views(np.repeat(places, 5, axis=0), 20, np.zeros(1), None, (-180, 180), 0)[1]
+    assert len(few) == 20 and {*np.diff(few)} <= {len(places) // 4, len(places) // 4 + 1}
 
 
 # --- on a map with the bundled weights
@@ -231,6 +292,23 @@ def test_an_audit_has_the_mean_score_of_the_views_and_their_weak_regions(look):
     np.testing.assert_array_equal(places["region"] > 0, weak)
     assert (places.loc[weak, "cause"] != "").all()
     assert look.audit(audit).share == pytest.approx(audit.share)
+
+
+def test_targets_are_at_the_heights_above_the_floor(look, room):
+    audit = look.audit([(2.0, 2.0, 1.5), (3.0, 2.0, 1.0)], views=8, height_m=(0.3, 2.5))
+    expected = [(2, 2, 0.3), (3, 2, 0.3), (2, 2, 2.5), (3, 2, 2.5)]
+    np.testing.assert_allclose(audit.views.positions[::2], expected, atol=1e-4)
+    without_mesh = WhereToLook.from_colmap(room[0], weights=WEIGHTS, device="cpu")
+    with pytest.raises(ConfigError, match="floor"):
+        without_mesh.audit([(2.0, 2.0, 1.5)], height_m=(1.0,))
+
+
+def test_views_outside_of_another_map_are_stated(look):
+    audit = look.audit([(2.0, 2.0, 1.5)], views=4)
+    views = audit.views
+    poses = poses_looking_along(np.array([(2.0, 2.0, 1.5)] * 3 + [(50.0, 2.0, 1.5)]), (1.0, 0.0, 0.0))
+    with pytest.warns(MapWarning, match="1 of 4 target views are outside"):
+        look.audit(replace(audit, views=replace(views, cam_from_world=poses)))
 
 
 def test_targets_are_those_of_a_viewpoint_map(look, tmp_path):
@@ -262,6 +340,7 @@ def test_depth_images_are_the_surface(room, tmp_path):
         ({"pitch_deg": (20.0, -20.0)}, ConfigError, "pitch_deg"),
         ({"pan_deg": (30.0, 30.0)}, ConfigError, "pan_deg"),
         ({"heigth_m": (1.0,)}, ConfigError, "height_m"),
+        ({"pan_deg": (-30.0, 30.0)}, ConfigError, "--targets"),
         ({"at": [(50.0, 0.0, 1.0)]}, TableError, "outside the map"),
         ({"at": [(2.0, 2.0, 1.5)], "pan_deg": (-30.0, 30.0)}, TableError, "heading"),
     ],
@@ -306,4 +385,5 @@ def test_audits_of_two_maps_and_several_mounts(room, tmp_path):
     assert len(record) == 2 and len({result["views"] for result in record.values()}) == 1
     table = pd.read_csv(tmp_path / "audit" / "mounts.csv")
     assert table[["height_m", "pitch_deg"]].to_numpy().tolist() == [[0.5, -20], [0.5, 0], [1.5, -20], [1.5, 0]]
+    assert len({*table["share"]}) == 4
     assert {"audit.csv", "audit.png", "mounts.png"} <= {path.name for path in (tmp_path / "audit").iterdir()}

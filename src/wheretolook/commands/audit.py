@@ -22,8 +22,8 @@ class AuditMap(TargetOptions, OpenOptions):
     """Audit a map: how many of the views that a robot will have localize, where they do not, and why. No photographs needed.
 
     Target views are at the places given (--targets: a file of `wheretolook select --at`, or x,y,z), else in all free
-    space: by --mesh or --depth at --height, or else near the mapping cameras. Their yaws are drawn, unless --pan limits
-    them. The share is the mean of their scores.
+    space: by --mesh or --depth at --height, or else near the mapping cameras. Their yaws are random, with --pan relative to
+    the headings of the places given. The share is the mean of their scores.
 
     Results (--out):
       audit.csv    one row for each place: its share, and the weak region that it is in, with the cause: too far, too
@@ -63,16 +63,17 @@ class AuditMap(TargetOptions, OpenOptions):
     def run(self) -> dict[str, Audit]:
         """Audit the map, write the results to `out` and print a summary."""
         from wheretolook.extend.audit import compare_mounts
-        from wheretolook.extend.report import save_audits
+        from wheretolook.extend.report import percent, save_audits
 
         start = time.monotonic()
         if self.against is not None:
             model_suffix(self.against)
         at = given_waypoints(self.at) if self.at else None
-        looks = {place_name(self.map): self.open_map()}
-        if self.against is not None:
-            name = place_name(self.against)
-            looks[name if name not in looks else str(self.against)] = self.open_map(self.against)
+        maps = [self.map] if self.against is None else [self.map, self.against]
+        names = [place_name(path) for path in maps]
+        if len({*names}) < len(names):
+            names = [str(path) for path in maps]
+        looks = {name: self.open_map(path) for name, path in zip(names, maps, strict=True)}
         options = {name: getattr(self, name) for name in TargetOptions.__dataclass_fields__}
         look = next(iter(looks.values()))
         audit = look.audit(at, **options)
@@ -81,10 +82,7 @@ class AuditMap(TargetOptions, OpenOptions):
         save_audits(audits, mounts, look.localization_map.landmarks.points, self.out)
         print(look.frame.describe())
         for name, audit in audits.items():
-            low, high = audit.interval
-            print(
-                f"{name}: {100 * audit.share:.1f} % [{100 * low:.1f}, {100 * high:.1f}] of {len(audit.views)} views localize"
-            )
+            print(f"{name}: {percent(audit.share, *audit.interval)} of {len(audit.views)} views localize")
             for region in audit.regions()[:5]:
                 where = ", ".join(f"{value:.2f}" for value in region["center"])
                 print(

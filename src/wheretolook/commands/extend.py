@@ -24,9 +24,9 @@ class Extend(TargetOptions, SelectorOptions):
     the rest of the list is not taken. Take them in the order of the list.
 
     Where the robot will be (--targets): a file of `wheretolook select --at`, or x,y,z, any number of them; by default all
-    free space at --height. Photographs are anywhere in free space: by --mesh or --depth, or else near the mapping cameras,
-    where the landmarks are all that is known of the surface. There the photographs are second views of what is weakly
-    mapped, and bridges to it; of new rooms the map shows nothing.
+    free space at --height. Photographs are anywhere in free space, by --mesh or --depth, or else near the mapping cameras,
+    and are planned for the map's camera. Without mesh or depth, the surface is known only at landmarks: `extend` then
+    proposes second views of weakly mapped surface, and cannot plan for unmapped rooms.
 
     Columns of --out (formats as of `wheretolook select`): gain in the predicted share of target views that localize; share
     after the photograph, with the 95 % interval over places; p_registers, the probability that the photograph registers;
@@ -65,7 +65,7 @@ class Extend(TargetOptions, SelectorOptions):
 
     def run(self) -> Extension:
         """Plan the photographs, write them to `out` and print a summary."""
-        from wheretolook.extend.report import heat_maps
+        from wheretolook.extend.report import heat_maps, percent
         from wheretolook.figures.floor_plan import save_figure
 
         start = time.monotonic()
@@ -93,10 +93,10 @@ class Extend(TargetOptions, SelectorOptions):
         )
         views = plan.views
         for row, name in enumerate(views.waypoint_id):
-            low, high = 100 * views.share_low[row], 100 * views.share_high[row]
+            share = percent(views.share[row], views.share_low[row], views.share_high[row])
             partner = f", with {views.partner[row]}" if views.partner[row] else ""
             text = f"P registers {views.p_registers[row]:.2f}{partner}; overlaps {views.overlaps[row] or 'its partner only'}"
-            print(f"{name:>3}: {100 * views.share[row]:.1f} % [{low:.1f}, {high:.1f}]; {text}")
+            print(f"{name:>3}: {share}; {text}")
         if after >= self.least_score:
             print(f"{100 * self.least_score:g} % are reached after {len(views)} photographs")
         elif len(views) < self.n:

@@ -59,10 +59,13 @@ class Audit:
         table["region"] = 0
         table["cause"] = ""
         weak = np.flatnonzero(table["share"] < 0.5)
-        usual = table.loc[table["share"] >= 0.5, "n_visible"].median() if len(weak) < len(table) else 200.0
         if len(weak):
-            tree = cKDTree(positions[weak] * views.frame.world_from_map.scale)
-            near = tree.sparse_distance_matrix(tree, 1.6 * self.apart_m)
+            strong = table.loc[table["share"] >= 0.5, "n_visible"]
+            usual = strong.median() if len(strong) else table["n_visible"].max()
+            # neighbours in the plane; without a floor, the heights of places of a storey differ as those of the cameras
+            reach_m = (1.6 * self.apart_m, 1.6 * self.apart_m, 1.5)
+            tree = cKDTree(views.frame.world_from_map.apply(positions[weak]) / reach_m)
+            near = tree.sparse_distance_matrix(tree, 1.0)
             region = connected_components(near, directed=False)[1]
             lost = np.bincount(region, (1 - table["share"].to_numpy()[weak]) * n_views[weak])
             for number, label in enumerate(np.argsort(-lost, kind="stable").tolist(), 1):
@@ -95,9 +98,9 @@ class Audit:
 def _cause(places: pd.DataFrame, usual: float) -> str:
     """Return why a region is weak: few landmarks are visible, or many of them are hard to match."""
     visible = places["n_visible"].sum()
-    if visible < 0.2 * usual * len(places):
+    if visible <= 0.2 * usual * len(places):
         return "nothing mapped"
-    shares = {cause: np.nan_to_num(places[name].sum() / visible) for name, cause in CAUSES.items()}
+    shares = {cause: places[name].sum() / visible for name, cause in CAUSES.items()}
     worst = max(shares, key=shares.__getitem__)
     return worst if shares[worst] > 0.3 else "few landmarks"
 

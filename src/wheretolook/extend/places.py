@@ -22,8 +22,8 @@ from wheretolook.utils.errors import ConfigError, SceneError
 def camera_places(space: Any, cameras: Float, height_m: float | None, most: int) -> tuple[Float, float]:
     """Return at most about `most` places (W, 3) m where a camera can be, and how far they are apart.
 
-    Above a floor of a `FreeSpace` they are at a height, by default the median one of the mapping cameras (M, 3), and a
-    walk leads there from the cameras. In a `MappedSpace`, without a floor, they are at the height of the nearest camera.
+    Above a floor of a `FreeSpace` they are at a height, by default the median one of the mapping cameras (M, 3), and
+    reachable in free space from the cameras. In a `MappedSpace`, without a floor, they are at the height of the nearest camera.
     Raises ConfigError for a height without a floor, SceneError if there is no place.
     """
     low, high = np.asarray(space.bounds, dtype=np.float64)
@@ -38,8 +38,7 @@ def camera_places(space: Any, cameras: Float, height_m: float | None, most: int)
         places = _reached(space, places, cameras, step)
     else:
         if height_m is not None:
-            fix = "Give --mesh or --depth, or leave the height out: that of the nearest camera."
-            raise ConfigError("heights are above a floor, which landmarks do not show", value=height_m, fix=fix)
+            raise _without_floor(height_m)
         nearest = cKDTree(cameras[:, :2]).query(ground)[1]
         places = np.column_stack([ground, cameras[nearest, 2]])
         places = places[space.is_free(places)]
@@ -94,6 +93,46 @@ def free_places(
     return np.concatenate([places for places, _ in found]), max(apart for _, apart in found)
 
 
+def photograph_places(localization_map: LocalizationMap, space: Any, heights_m: tuple[float, ...], most: int) -> Float:
+    """Return places (W, 3) m as `free_places`, each with others near enough that two photographs map a landmark.
+
+    Where places are coarse, they are half as many, and each has a partner 0.7 m beside it if there is free space.
+    """
+    places, apart = free_places(localization_map, space, heights_m, most)
+    if apart <= 1.0:
+        return places
+    places = places[::2]
+    angles = np.radians(45 * np.arange(8))
+    ring = 0.7 * np.column_stack([np.cos(angles), np.sin(angles), np.zeros(8)])
+    start = np.repeat(places, 8, axis=0)
+    end = start + np.tile(ring, (len(places), 1))
+    free = space.segments_are_free(start, end)
+    if isinstance(space, FreeSpace):  # on the same storey: at most a step or a slope between them
+        free &= np.abs(space.floor_below(start) - space.floor_below(end)) < 0.5
+    free = free.reshape(-1, 8)
+    partners = end.reshape(-1, 8, 3)[np.arange(len(places)), free.argmax(axis=1)]
+    return np.concatenate([places, partners[free.any(axis=1)]])
+
+
+def places_at_heights(space: Any, places: Float, heights_m: tuple[float, ...]) -> Float:
+    """Return places (H * W, 3) m at each of the heights above the floor below places (W, 3).
+
+    Raises ConfigError if there is no floor.
+    """
+    if not isinstance(space, FreeSpace):
+        raise _without_floor(heights_m[0])
+    floor = space.floor_below(places)
+    for row in np.flatnonzero(np.isnan(floor))[:1]:
+        fix = "Give places above the floor, or leave the height out."
+        raise ConfigError("there is no floor below a place", value=places[row].round(3).tolist(), fix=fix)
+    return np.concatenate([np.column_stack([places[:, :2], floor + height]) for height in heights_m])
+
+
+def _without_floor(height_m: float) -> ConfigError:
+    fix = "Give --mesh or --depth, or leave the height out."
+    return ConfigError("heights are above a floor, which landmarks do not show", value=height_m, fix=fix)
+
+
 def yaws_around(camera: Camera) -> int:
     """Return how many views all around overlap by half of the camera's width, 6 to 12."""
     return int(np.clip(round(720 / max(field_of_view_deg(camera)[0], 1)), 6, 12))
@@ -110,12 +149,12 @@ def views_around(places: Float, n_yaws: int, pitches_deg: Float) -> tuple[Float,
 def drawn_views(
     places: Float, n: int, pitches_deg: Float, heading_deg: Float | None, pan_deg: tuple[float, float], seed: int
 ) -> tuple[Float, NDArray[np.int64]]:
-    """Draw about n poses evenly over places (W, 3), at least one at each, and return the row of each one's place.
+    """Draw n poses, spread evenly over places (W, 3), and return the row of each one's place.
 
     Yaws are within limits relative to headings (W,); without headings, any.
     """
     rng = np.random.default_rng(seed)
-    rows = np.repeat(np.arange(len(places)), max(1, round(n / len(places))))
+    rows = np.arange(n) * len(places) // n
     low, high = (-180.0, 180.0) if heading_deg is None else pan_deg
     yaws = rng.uniform(low, high, len(rows)) + (0 if heading_deg is None else heading_deg[rows])
     angles = np.column_stack([yaws, rng.choice(pitches_deg, len(rows))])

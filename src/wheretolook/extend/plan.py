@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -19,9 +20,10 @@ from wheretolook.evaluation.statistics import ClusterBootstrap
 from wheretolook.extend.surface import Surface, mapping_views
 from wheretolook.geometry.poses import Float, camera_centers
 from wheretolook.geometry.views import Views
+from wheretolook.localization.confidence import RIGHT_PLACE_LIMITS
 from wheretolook.mapping.colmap_model import observation_matrix
 from wheretolook.scorers.base import Scorer
-from wheretolook.utils.errors import MapError, MapWarning, SceneError
+from wheretolook.utils.errors import ConfigError, MapError, MapWarning, SceneError
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,9 +46,9 @@ class Extension:
 
 
 def fit_coverage(coverage: Float, scores: Float) -> tuple[float, float]:
-    """Fit scores (T,) by a logistic function of the covered share of views (T,) that does not fall.
+    """Fit scores (T,) by a logistic function of the covered share of views (T,).
 
-    Returns its offset and slope.
+    Returns its offset and its slope, which is positive.
     """
 
     def loss(values: Float) -> float:
@@ -69,6 +71,9 @@ class Planner:
 
     def __init__(self, scorer: Scorer, space: Any, targets: Views, candidates: Float) -> None:
         self.scorer = scorer
+        self.registration = scorer  # a photograph registers if it is at the right place, less than a robot needs
+        with suppress(ConfigError):  # the method has scores of one accuracy only
+            self.registration = scorer.at_accuracy(RIGHT_PLACE_LIMITS)
         self.targets = targets
         self.surface = Surface(scorer.localization_map, space)
         self.images, self.cameras = mapping_views(scorer.localization_map)
@@ -111,8 +116,12 @@ class Planner:
 
     @cached_property
     def scores(self) -> Float:
-        """Scores (C,) of the candidates on the present map."""
-        return self.scorer.score(self.candidates)
+        """Probabilities (C,) that the candidates register in the present map."""
+        return self.registration.score(self.candidates)
+
+    @cached_property
+    def _fitted_registration(self) -> tuple[float, float]:
+        return fit_coverage(self.candidate_coverage, self.scores)
 
     def _expected(self, coverage: Float) -> Float:
         return expit(self.offset + self.slope * coverage)
@@ -127,8 +136,9 @@ class Planner:
 
     def registers(self) -> Float:
         """Return the probability (C,) that each candidate registers with the photographs so far."""
-        now = self.seen.shares(self.seen_count >= 2)
-        return np.clip(self.scores + self._expected(now) - self._expected(self.candidate_coverage), 0, 1)
+        offset, slope = self._fitted_registration
+        now = expit(offset + slope * self.seen.shares(self.seen_count >= 2))
+        return np.clip(self.scores + now - expit(offset + slope * self.candidate_coverage), 0, 1)
 
     @cached_property
     def pairs(self) -> NDArray[np.int64]:
@@ -174,8 +184,12 @@ class Planner:
         """Choose up to n photographs, greedily in pairs of which one registers with at least `least_p` in the map so far.
 
         They end where the predicted share of target views that localize reaches `until`, or nothing is gained. Raises
-        MapError if none registers.
+        MapError if none registers, SceneError if no two of them can map a landmark.
         """
+        if n > 1 and len(self.pairs) == 0:
+            fix = "Check --height and the scale, widen --pitch, or take single photographs: --n 1."
+            problem = "no two photographs are 0.35 to 1.4 m apart and less than 50 degrees"
+            raise SceneError(problem, value=f"{len(self.candidates)} photographs", fix=fix)
         bootstrap = ClusterBootstrap(self.targets.waypoint, 1000, seed)
         ones = np.ones(len(self.targets))
         before = float(self.targets.score.mean())
@@ -222,7 +236,7 @@ class Planner:
         views = Views(poses, self.camera, self.scorer.name, waypoint=np.arange(len(rows)))
         ids = tuple(str(number) for number in range(1, len(rows) + 1))
         views = replace(
-            views, waypoint_id=ids, rank=np.ones(len(rows), dtype=np.int64), score=self.scores[rows], **columns
+            views, waypoint_id=ids, rank=np.ones(len(rows), dtype=np.int64), score=self.scorer.score(poses), **columns
         )
         return views.in_frame(self.scorer.localization_map.frame)
 

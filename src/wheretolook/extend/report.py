@@ -76,6 +76,11 @@ def mount_figure(mounts: pd.DataFrame) -> Figure:
         return figure
 
 
+def percent(share: float, low: float, high: float) -> str:
+    """Return a share in per cent with its interval, without it if that is unknown (NaN)."""
+    return f"{100 * share:.1f} %" + (f" [{100 * low:.1f}, {100 * high:.1f}]" if np.isfinite([low, high]).all() else "")
+
+
 def save_audits(audits: dict[str, Audit], mounts: pd.DataFrame, landmarks: Float, out: Path) -> None:
     """Write audit.csv, audit.json and audit.png, of several maps together, and of several mounts mounts.csv and .png."""
     table = pd.concat([audit.places().assign(map=name) for name, audit in audits.items()])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import replace
@@ -16,7 +17,15 @@ from wheretolook.dataset.config import ACCURACY, Accuracy
 from wheretolook.dataset.scene import ColmapFiles, Scene
 from wheretolook.extend.audit import Audit
 from wheretolook.extend.config import TargetOptions, check_extension
-from wheretolook.extend.places import drawn_views, free_places, pitches_within, views_around, yaws_around
+from wheretolook.extend.places import (
+    drawn_views,
+    free_places,
+    photograph_places,
+    pitches_within,
+    places_at_heights,
+    views_around,
+    yaws_around,
+)
 from wheretolook.extend.plan import Extension, Planner
 from wheretolook.geometry.camera import Camera, PinholeCamera, parse_camera
 from wheretolook.geometry.lattices import Lattice, direction_lattice
@@ -35,7 +44,7 @@ from wheretolook.select.waypoints import SelectionRequest, Waypoints, grid_waypo
 from wheretolook.space.mapped_space import MappedSpace
 from wheretolook.training.weights import method_of_weights
 from wheretolook.utils.devices import usable_device
-from wheretolook.utils.errors import ConfigError, MapError, PlanningError, check_names
+from wheretolook.utils.errors import ConfigError, MapError, MapWarning, PlanningError, check_names
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -335,11 +344,14 @@ class WhereToLook:
             at: locations of the camera, or an audit of another map, whose views are scored again; None for all free space
                 at the heights of the camera.
             heading_deg: yaws (W,) of the robot at the points, for a limit on pan.
-            options: fields of `wheretolook.extend.config.TargetOptions`.
+            options: fields of `wheretolook.extend.config.TargetOptions`; with points, `height_m` moves them up or down.
+
+        A `MapWarning` counts the views of another map's audit that are outside this map.
 
         Raises:
             TableError: as `best`.
-            ConfigError: an option is out of range, the scores are no probabilities, or a height is given without a floor.
+            ConfigError: an option is out of range, the scores are no probabilities, a height is given without a floor, or
+                a limit on pan without points.
             SceneError: there is no place where a camera can be.
         """
         if not is_probability(self.scorer.name):
@@ -350,16 +362,30 @@ class WhereToLook:
         to_world = self.frame.world_from_map
         if isinstance(at, Audit):
             again = to_world.apply_to_poses(at.views.cam_from_world)
-            return replace(at, views=self._target_views(again, at.views.waypoint, at.views.waypoint_id))
+            outside = ~usable_waypoints(self.localization_map, Waypoints.of(at.views.positions), skip=True)
+            if outside.any():
+                text = f"{outside.sum()} of {len(again)} target views are outside this map, or inside its geometry"
+                warnings.warn(f"{self.localization_map.map.path}: {text}", MapWarning, stacklevel=2)
+            apart_m = at.apart_m * to_world.scale / at.views.frame.world_from_map.scale
+            return Audit(self._target_views(again, at.views.waypoint, at.views.waypoint_id), apart_m)
         heading = None
         apart_m = 1.0
         if at is None:
+            if request.pan_deg is not None:
+                fix = "Give the places and headings of the robot, --targets, or leave pan out."
+                raise ConfigError("pan is relative to headings", value=request.pan_deg, fix=fix)
             places, apart_m = free_places(self.localization_map, self.space, request.height_m, 300)
             waypoints = Waypoints.of(places)
         else:
             waypoints = Waypoints.of(at, (), heading_deg)
             waypoints = waypoints[usable_waypoints(self.localization_map, waypoints, request.skip)]
             places = to_world.apply(waypoints.points)
+            if request.height_m:
+                places = places_at_heights(self.space, places, request.height_m)
+                each = waypoints[np.tile(np.arange(len(waypoints)), len(request.height_m))]
+                waypoints = replace(each, points=to_world.inverse.apply(places))
+                kept = usable_waypoints(self.localization_map, waypoints, request.skip)
+                waypoints, places = waypoints[kept], places[kept]
             heading = None if request.pan_deg is None else waypoints.heading_deg(to_world.rotation)
         pitches = pitches_within(request.pitch_deg)
         limits = request.pan_deg or (-180.0, 180.0)
@@ -403,8 +429,8 @@ class WhereToLook:
         request = TargetOptions(**options)
         yaws = yaws_around(self.localization_map.camera)
         pitches = pitches_within(request.pitch_deg)
-        most = 2400 // (yaws * len(pitches) * max(1, len(request.height_m)))
-        places, _ = free_places(self.localization_map, self.space, request.height_m, most)
+        most = max(1, 2400 // (yaws * len(pitches) * max(1, len(request.height_m))))
+        places = photograph_places(self.localization_map, self.space, request.height_m, most)
         candidates, _ = views_around(places, yaws, pitches)
         return Planner(self.scorer, self.space, audit.views, candidates).plan(n, least_p, until, request.seed)
 

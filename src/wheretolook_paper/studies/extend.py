@@ -100,11 +100,12 @@ def chosen_by(policy: str, planner: Planner, n: int, least_p: float, seed: int) 
         return candidates[np.random.default_rng(seed).permutation(len(candidates))[:n]]
     centers = camera_centers(candidates)
     taken = camera_centers(planner.images)
+    scores = planner.scorer.score(candidates)
     rows: list[int] = []
     for _ in range(n):
         apart = np.linalg.norm(centers[:, None] - taken, axis=2).min(axis=1)
         # the lowest scores are close to one another: those taken are a metre apart
-        value = apart if policy == "farthest" else np.where(apart > 1.0, -planner.scores, -np.inf)
+        value = apart if policy == "farthest" else np.where(apart > 1.0, -scores, -np.inf)
         rows.append(int(value.argmax()))
         taken = np.concatenate([taken, centers[rows[-1:]]])
     return candidates[rows]

@@ -164,7 +164,7 @@ def test_odometry_makes_a_rig_of_ambiguous_views(robot):
         if alone[-1][1] >= 0.95:
             break
     n_views, probability = alone[-1]
-    assert n_views >= 2 and probability >= 0.95 > alone[0][1], alone
+    assert n_views >= 2 and probability >= 0.9 > alone[0][1], alone
     robot.localized(base, 0.05, 0.4)
 
 

@@ -312,6 +312,14 @@ def test_views_outside_of_another_map_are_stated(look):
         look.audit(replace(audit, views=replace(views, cam_from_world=poses)))
 
 
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_places_of_a_map_of_unknown_scale_are_as_far_apart_in_its_unit(look, tmp_path):
+    other = WhereToLook.from_colmap(write_room(tmp_path / "other", metric=False), weights=WEIGHTS, device="cpu")
+    scale = other.frame.world_from_map.scale
+    again = other.audit(look.audit([(2.0, 2.0, 1.5)], views=2))
+    assert scale != 1 and again.apart_m == pytest.approx(scale)
+
+
 def test_targets_are_those_of_a_viewpoint_map(look, tmp_path):
     grid = VoxelGrid((1.5, 1.5, 1.2), (3.5, 2.5, 1.8), (2, 1, 1))
     build_viewpoint_map(look.scorer, grid, [0, 1], np.eye(3)[:2]).save(tmp_path / "viewpoints")

@@ -12,7 +12,8 @@ from colmap_models import colmap_model
 from selection.room import WEIGHTS, write_room
 from wheretolook.cli import main
 from wheretolook.extend.audit import Audit
-from wheretolook.extend.places import camera_places, drawn_views, photograph_places, pitches_within, views_around
+from wheretolook.extend.config import TargetOptions
+from wheretolook.extend.places import camera_places, drawn_views, photograph_candidates, pitches_within, views_around
 from wheretolook.extend.plan import Planner, fit_coverage
 from wheretolook.extend.report import percent
 from wheretolook.extend.surface import Patches, Surface
@@ -131,12 +132,12 @@ def test_a_list_ends_at_the_share_asked_for_and_an_odd_one_with_a_single_photogr
 def test_large_places_have_pairs(half_mapped):
     scorer, _ = half_mapped
     space = FreeSpace(box_room((34.0, 34.0, 3.0)))
-    places = photograph_places(scorer.localization_map, space, (), 300)
-    assert 200 < len(places) <= 350 and space.is_free(places).all()
-    candidates, rows = views_around(places, 8, np.zeros(1))
+    candidates = photograph_candidates(scorer.localization_map, space, TargetOptions())
+    places = np.unique(camera_centers(candidates).round(6), axis=0)
+    assert len(candidates) == 8 * len(places) and 200 < len(places) <= 350 and space.is_free(places).all()
     planner = planner_of(scorer, half_mapped[1])
     planner.candidates = candidates
-    assert {*rows[planner.pairs].ravel()} == {*range(len(places))}
+    assert {*planner.pairs.ravel().tolist()} == {*range(len(candidates))}
     planner.pairs = planner.pairs[:0]
     with pytest.raises(SceneError, match=r"0\.35 to 1\.4 m.*--n 1"):
         planner.plan(2)

@@ -70,10 +70,10 @@ class AuditMap(TargetOptions, OpenOptions):
             model_suffix(self.against)
         at = given_waypoints(self.at) if self.at else None
         maps = [self.map] if self.against is None else [self.map, self.against]
-        names = [place_name(path) for path in maps]
-        if len({*names}) < len(names):
-            names = [str(path) for path in maps]
-        looks = {name: self.open_map(path) for name, path in zip(names, maps, strict=True)}
+        named = {place_name(path): path for path in maps}
+        if len(named) < len(maps):
+            named = {str(path): path for path in maps}
+        looks = {name: self.open_map(path) for name, path in named.items()}
         options = {name: getattr(self, name) for name in TargetOptions.__dataclass_fields__}
         look = next(iter(looks.values()))
         audit = look.audit(at, **options)

@@ -108,11 +108,8 @@ def _cause(places: pd.DataFrame, usual: float) -> str:
 def compare_mounts(audit: Callable[..., Audit], options: TargetOptions) -> pd.DataFrame:
     """Audit each height and pitch of the options, by a function that takes them, for a fixed camera: a row of each."""
     rows = []
-    each: list[tuple[float, ...]] = [(height,) for height in options.height_m]
-    for heights in each or [()]:
+    for height in options.height_m or (np.nan,):
         for pitch in pitches_within(options.pitch_deg).tolist():
-            done = audit(height_m=heights, pitch_deg=(pitch, pitch))
-            low, high = done.interval
-            row = {"height_m": heights[0] if heights else np.nan, "pitch_deg": pitch, "share": done.share}
-            rows.append({**row, "share_low": low, "share_high": high, "views": len(done.views)})
-    return pd.DataFrame(rows)
+            done = audit(height_m=options.height_m and (height,), pitch_deg=(pitch, pitch))
+            rows.append((height, pitch, done.share, *done.interval, len(done.views)))
+    return pd.DataFrame(rows, columns=["height_m", "pitch_deg", "share", "share_low", "share_high", "views"])

@@ -10,6 +10,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from wheretolook.extend.config import TargetOptions
 from wheretolook.extend.surface import mapping_views
 from wheretolook.geometry.camera import Camera, field_of_view_deg
 from wheretolook.geometry.lattices import axes_of_angles
@@ -24,7 +25,7 @@ def camera_places(space: Any, cameras: Float, height_m: float | None, most: int)
 
     Above a floor of a `FreeSpace` they are at a height, by default the median one of the mapping cameras (M, 3), and
     reachable in free space from the cameras. In a `MappedSpace`, without a floor, they are at the height of the nearest camera.
-    Raises ConfigError for a height without a floor, SceneError if there is no place.
+    Raises SceneError if there is no place.
     """
     low, high = np.asarray(space.bounds, dtype=np.float64)
     step = max(0.25, float(np.sqrt(np.prod(high[:2] - low[:2]) / 40_000)))
@@ -37,8 +38,6 @@ def camera_places(space: Any, cameras: Float, height_m: float | None, most: int)
         places = _above_floors(space, ground, height_m)
         places = _reached(space, places, cameras, step)
     else:
-        if height_m is not None:
-            raise _without_floor(height_m)
         nearest = cKDTree(cameras[:, :2]).query(ground)[1]
         places = np.column_stack([ground, cameras[nearest, 2]])
         places = places[space.is_free(places)]
@@ -93,44 +92,18 @@ def free_places(
     return np.concatenate([places for places, _ in found]), max(apart for _, apart in found)
 
 
-def photograph_places(localization_map: LocalizationMap, space: Any, heights_m: tuple[float, ...], most: int) -> Float:
-    """Return places (W, 3) m as `free_places`, each with others near enough that two photographs map a landmark.
+def places_at_heights(space: FreeSpace, places: Float, heights_m: tuple[float, ...]) -> Float:
+    """Return the places (H * W, 3) m at each of the heights above the floor below places (W, 3).
 
-    Where places are coarse, they are half as many, and each has a partner 0.7 m beside it if there is free space.
+    Raises ConfigError if there is no floor below one.
     """
-    places, apart = free_places(localization_map, space, heights_m, most)
-    if apart <= 1.0:
-        return places
-    places = places[::2]
-    angles = np.radians(45 * np.arange(8))
-    ring = 0.7 * np.column_stack([np.cos(angles), np.sin(angles), np.zeros(8)])
-    start = np.repeat(places, 8, axis=0)
-    end = start + np.tile(ring, (len(places), 1))
-    free = space.segments_are_free(start, end)
-    if isinstance(space, FreeSpace):  # on the same storey: at most a step or a slope between them
-        free &= np.abs(space.floor_below(start) - space.floor_below(end)) < 0.5
-    free = free.reshape(-1, 8)
-    partners = end.reshape(-1, 8, 3)[np.arange(len(places)), free.argmax(axis=1)]
-    return np.concatenate([places, partners[free.any(axis=1)]])
-
-
-def places_at_heights(space: Any, places: Float, heights_m: tuple[float, ...]) -> Float:
-    """Return places (H * W, 3) m at each of the heights above the floor below places (W, 3).
-
-    Raises ConfigError if there is no floor.
-    """
-    if not isinstance(space, FreeSpace):
-        raise _without_floor(heights_m[0])
     floor = space.floor_below(places)
     for row in np.flatnonzero(np.isnan(floor))[:1]:
         fix = "Give places above the floor, or leave the height out."
         raise ConfigError("there is no floor below a place", value=places[row].round(3).tolist(), fix=fix)
-    return np.concatenate([np.column_stack([places[:, :2], floor + height]) for height in heights_m])
-
-
-def _without_floor(height_m: float) -> ConfigError:
-    fix = "Give --mesh or --depth, or leave the height out."
-    return ConfigError("heights are above a floor, which landmarks do not show", value=height_m, fix=fix)
+    moved = np.tile(places, (len(heights_m), 1))
+    moved[:, 2] = np.add.outer(heights_m, floor).ravel()
+    return moved
 
 
 def yaws_around(camera: Camera) -> int:
@@ -159,3 +132,26 @@ def drawn_views(
     yaws = rng.uniform(low, high, len(rows)) + (0 if heading_deg is None else heading_deg[rows])
     angles = np.column_stack([yaws, rng.choice(pitches_deg, len(rows))])
     return poses_looking_along(places[rows], axes_of_angles(angles)), rows
+
+
+def photograph_candidates(localization_map: LocalizationMap, space: Any, options: TargetOptions) -> Float:
+    """Return about 2,400 poses (C, 3, 4) all around at places, each with others near enough to map a landmark together.
+
+    Where places are coarse, they are half as many, and each has a partner 0.7 m beside it if there is free space.
+    """
+    yaws = yaws_around(localization_map.camera)
+    pitches = pitches_within(options.pitch_deg)
+    most = max(1, 2400 // (yaws * len(pitches) * max(1, len(options.height_m))))
+    places, apart = free_places(localization_map, space, options.height_m, most)
+    if apart > 1.0:
+        places = places[::2]
+        ring = 0.7 * axes_of_angles(np.column_stack([45.0 * np.arange(8), np.zeros(8)]))
+        beside = places[:, None] + ring
+        start, end = np.repeat(places, 8, axis=0), beside.reshape(-1, 3)
+        free = space.segments_are_free(start, end)
+        if isinstance(space, FreeSpace):  # on the same storey: at most a step or a slope between them
+            free &= np.abs(space.floor_below(start) - space.floor_below(end)) < 0.5
+        free = free.reshape(-1, 8)
+        partners = beside[np.arange(len(places)), free.argmax(axis=1)]
+        places = np.concatenate([places, partners[free.any(axis=1)]])
+    return views_around(places, yaws, pitches)[0]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -61,6 +61,12 @@ def fit_coverage(coverage: Float, scores: Float) -> tuple[float, float]:
     return float(offset), float(np.exp(log_slope))
 
 
+def raised(scores: Float, fitted: tuple[float, float], before: Float, now: Float) -> Float:
+    """Return scores changed as a fitted function of covered shares does, from those before to those now."""
+    offset, slope = fitted
+    return np.clip(scores + expit(offset + slope * now) - expit(offset + slope * before), 0, 1)
+
+
 class Planner:
     """Gains of candidate photographs (C, 3, 4) for target views with scores and places, in the map's own frame.
 
@@ -98,7 +104,7 @@ class Planner:
             shape=(len(self.patches.view), len(targets)),
         )
         self.coverage = self.patches.shares(self.count >= 2)
-        self.offset, self.slope = fit_coverage(self.coverage, targets.score)
+        self.fitted = fit_coverage(self.coverage, targets.score)
         # the same of the candidates themselves, which must register
         self.seen = self.surface.patches(self.candidates, 5, 4)
         seen = self.surface.covering(self.seen, self.images, self.cameras)
@@ -123,22 +129,18 @@ class Planner:
     def _fitted_registration(self) -> tuple[float, float]:
         return fit_coverage(self.candidate_coverage, self.scores)
 
-    def _expected(self, coverage: Float) -> Float:
-        return expit(self.offset + self.slope * coverage)
-
     def predicted(self) -> Float:
         """Return the probability (T,) that each target view localizes with the photographs so far."""
         return self._predicted(self.patches.shares(self.count >= 2))
 
     def _predicted(self, coverage: Float) -> Float:
         """Return the probabilities (..., T) that target views localize if these shares of them are covered."""
-        return np.clip(self.targets.score + self._expected(coverage) - self._expected(self.coverage), 0, 1)
+        return raised(self.targets.score, self.fitted, self.coverage, coverage)
 
     def registers(self) -> Float:
         """Return the probability (C,) that each candidate registers with the photographs so far."""
-        offset, slope = self._fitted_registration
-        now = expit(offset + slope * self.seen.shares(self.seen_count >= 2))
-        return np.clip(self.scores + now - expit(offset + slope * self.candidate_coverage), 0, 1)
+        now = self.seen.shares(self.seen_count >= 2)
+        return raised(self.scores, self._fitted_registration, self.candidate_coverage, now)
 
     @cached_property
     def pairs(self) -> NDArray[np.int64]:
@@ -223,8 +225,10 @@ class Planner:
                 records.append((share - before, share, low, high, registers, partner, overlaps))
                 before = share
         views = self._reported(rows, records)
-        fitted = np.corrcoef(self._expected(self.coverage), self.targets.score)[0, 1] if len(ones) > 1 else np.nan
-        return Extension(views, self.targets, self.predicted(), self.surface.name, float(fitted))
+        offset, slope = self.fitted
+        expected = expit(offset + slope * self.coverage)
+        correlation = np.corrcoef(expected, self.targets.score)[0, 1] if len(ones) > 1 else np.nan
+        return Extension(views, self.targets, self.predicted(), self.surface.name, float(correlation))
 
     def _reported(self, rows: list[int], records: list[tuple[Any, ...]]) -> Views:
         """Return the chosen photographs in the map's own frame."""
@@ -233,11 +237,10 @@ class Planner:
         columns: dict[str, Any] = dict.fromkeys(names, ())
         for name, values in zip(names, zip(*records, strict=True), strict=False):
             columns[name] = values if isinstance(values[0], str) else np.array(values)
-        views = Views(poses, self.camera, self.scorer.name, waypoint=np.arange(len(rows)))
-        ids = tuple(str(number) for number in range(1, len(rows) + 1))
-        views = replace(
-            views, waypoint_id=ids, rank=np.ones(len(rows), dtype=np.int64), score=self.scorer.score(poses), **columns
-        )
+        columns["waypoint_id"] = tuple(str(number) for number in range(1, len(rows) + 1))
+        columns["rank"] = np.ones(len(rows), dtype=np.int64)
+        columns["score"] = self.scorer.score(poses)
+        views = Views(poses, self.camera, self.scorer.name, waypoint=np.arange(len(rows)), **columns)
         return views.in_frame(self.scorer.localization_map.frame)
 
     def _warn_of_parts(self) -> None:

@@ -78,7 +78,8 @@ def mount_figure(mounts: pd.DataFrame) -> Figure:
 
 def percent(share: float, low: float, high: float) -> str:
     """Return a share in per cent with its interval, without it if that is unknown (NaN)."""
-    return f"{100 * share:.1f} %" + (f" [{100 * low:.1f}, {100 * high:.1f}]" if np.isfinite([low, high]).all() else "")
+    interval = "" if np.isnan(low) else f" [{100 * low:.1f}, {100 * high:.1f}]"
+    return f"{100 * share:.1f} %{interval}"
 
 
 def save_audits(audits: dict[str, Audit], mounts: pd.DataFrame, landmarks: Float, out: Path) -> None:

@@ -17,15 +17,7 @@ from wheretolook.dataset.config import ACCURACY, Accuracy
 from wheretolook.dataset.scene import ColmapFiles, Scene
 from wheretolook.extend.audit import Audit
 from wheretolook.extend.config import TargetOptions, check_extension
-from wheretolook.extend.places import (
-    drawn_views,
-    free_places,
-    photograph_places,
-    pitches_within,
-    places_at_heights,
-    views_around,
-    yaws_around,
-)
+from wheretolook.extend.places import drawn_views, free_places, photograph_candidates, pitches_within, places_at_heights
 from wheretolook.extend.plan import Extension, Planner
 from wheretolook.geometry.camera import Camera, PinholeCamera, parse_camera
 from wheretolook.geometry.lattices import Lattice, direction_lattice
@@ -359,6 +351,9 @@ class WhereToLook:
             raise ConfigError("the scores of this method are no probabilities", value=self.scorer.name, fix=fix)
         check_names("option of audit", options, TargetOptions, ("at", "heading_deg"))
         request = TargetOptions(**options)
+        if request.height_m and isinstance(self.space, MappedSpace):
+            fix = "Give --mesh or --depth, or leave the height out."
+            raise ConfigError("heights are above a floor, which landmarks do not show", value=request.height_m, fix=fix)
         to_world = self.frame.world_from_map
         if isinstance(at, Audit):
             again = to_world.apply_to_poses(at.views.cam_from_world)
@@ -427,11 +422,7 @@ class WhereToLook:
         check_extension(n, until, least_p)
         audit = self.audit(at, heading_deg, **options)
         request = TargetOptions(**options)
-        yaws = yaws_around(self.localization_map.camera)
-        pitches = pitches_within(request.pitch_deg)
-        most = max(1, 2400 // (yaws * len(pitches) * max(1, len(request.height_m))))
-        places = photograph_places(self.localization_map, self.space, request.height_m, most)
-        candidates, _ = views_around(places, yaws, pitches)
+        candidates = photograph_candidates(self.localization_map, self.space, request)
         return Planner(self.scorer, self.space, audit.views, candidates).plan(n, least_p, until, request.seed)
 
     def floor_plan(self, views: Views) -> Figure:

@@ -151,20 +151,20 @@ def test_a_dark_image_is_lost_and_a_next_view_is_published(robot):
 
 
 def test_odometry_makes_a_rig_of_ambiguous_views(robot):
-    """Through a small window each view alone is not confident; together they are."""
+    """Through a small window each view alone is not confident, as much of what is expected is not found; together they are."""
     base = base_at(3.2, 2.4, 75.0)
     alone = []
     for pan in (-0.6, 0.1, 0.8, 1.5):
         rgb = robot.rgb(base, pan)
         masked = np.zeros_like(rgb)
-        masked[180:300, 255:385] = rgb[180:300, 255:385]
+        masked[160:320, 235:405] = rgb[160:320, 235:405]
         status = robot.see(image_of(masked), info_of(CAMERA), odometry=base_at(7.0, -2.0, 10.0), joints=(pan, 0.0))
         values = {pair.key: pair.value for pair in status.values}
         alone.append((int(values["n_views"]), json.loads(values["probabilities"])[0]))
         if alone[-1][1] >= 0.95:
             break
     n_views, probability = alone[-1]
-    assert n_views >= 2 and probability >= 0.9 > alone[0][1], alone
+    assert n_views >= 2 and probability >= 0.95 > alone[0][1], alone
     robot.localized(base, 0.05, 0.4)
 
 

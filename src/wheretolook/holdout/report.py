@@ -227,10 +227,9 @@ class CheckReport:
             good, every = (_with_interval(ratios[name], 2) for name in ("localized", "all"))
             lines.append(f"inliers over expected: {good} of views that localize, {every} of all")
         if of_map := numbers.get("map"):
-            noise_px, scale, offset = of_map.values()
             lines.append(
-                f"keypoint noise of the map {noise_px:.2f} px, errors as of {scale:.2f} px; log-odds of detection "
-                f"{offset or 0:+.2f}"
+                f"keypoint noise of the map {of_map['keypoint_noise_px']:.2f} px, errors as of "
+                f"{of_map['error_scale']:.2f} px; log-odds of detection {of_map['detection_offset'] or 0:+.2f}"
             )
         if source.fov_deg is not None:
             lines.append(f"views of {source.fov_deg:g} degrees, {source.n_crops} of each photograph")

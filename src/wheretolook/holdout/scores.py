@@ -99,9 +99,9 @@ def score_views(
 ) -> tuple[str, pd.DataFrame]:
     """Score the views of all blocks; returns the name of the checked method, and the views with further columns.
 
-    They are score, expected_inliers and expected errors (NaN where the method has none), n_visible, in_range, `visible` (n_visible again),
-    one for each further method, block and is_part. Scores that are shares of the map's landmarks are multiplied by
-    their number, as blocks have maps of different sizes.
+    They are score, expected_inliers and expected errors (NaN where the method has none), n_visible, in_range, `visible`
+    (n_visible again), one for each further method, block and is_part. Scores that are shares of the map's landmarks
+    are multiplied by their number, as blocks have maps of different sizes.
     """
     parts = []
     name = ""

@@ -174,6 +174,8 @@ def probabilities(trained: TrainedNetwork[SetNetwork], accuracy: Accuracy, views
     with torch.inference_mode():
         logits = trained.network.logits(views).double()
         own = np.asarray(trained.calibrated(logits).sigmoid().cpu().numpy())
+    if trained.error_scale is None and accuracy == trained.accuracy:  # without further statistics
+        return own
     return np.asarray(model_of(trained).at(accuracy, trained.accuracy, own, statistics_of(trained, views)))
 
 

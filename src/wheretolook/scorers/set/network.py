@@ -120,7 +120,7 @@ def mapped_precision(values: Tensor, attributes: tuple[str, ...] = ATTRIBUTES) -
 
 
 def along(spread: Tensor) -> Tensor:
-    """Return by how much more than 1 the variance of landmarks along their mean direction is, of that across it."""
+    """Return the excess variance of landmarks along their mean direction over that across it, which is one."""
     return 0.5 / spread.clamp(min=1e-6) - 1  # rays in one direction: 1,000 times the deviation, and finite
 
 
@@ -177,7 +177,7 @@ more it overfits its training scenes (docs/research/learners.md). None depends o
 
 MAPPED_DEVIATIONS = ("log_mapped_position_deviation", "log_mapped_orientation_deviation")
 """Logs of the expected standard deviations of a pose by `mapped_precision`, in metres and degrees, for keypoints with a
-noise of 1 / 320 rad."""
+noise of one pixel, in the mapping images and in the camera's."""
 
 CELLS = 30
 """Cells that 180 degrees are cut into, across and down: 6 degrees each, the same for every camera."""

@@ -166,28 +166,40 @@ class Robot(Node):
         return np.ascontiguousarray(self.renderer.render(camera, pose[None]).rgb[0], dtype=np.uint8)
 
     def see(self, message, info=None, odometry=None, joints=(0.0, 0.0), step_s=1.0):
-        """Publish an image with what belongs to its time; returns the diagnostics of this image."""
+        """Publish an image with what belongs to its time; returns the diagnostics of this image.
+
+        All of it is sent again if some did not arrive: a node may discover this one's publishers after its own
+        subscriptions are discovered, and sensor QoS may drop an image.
+        """
         self.stamp += step_s
         self.received.clear()
-        self.send("joint_states", JointState(name=self.joints, position=list(joints)))
-        if odometry is not None:
-            odom = Odometry()
-            odom.pose.pose = pose_message(odometry)
-            self.send("odom", odom)
-        if info is not None:
-            self.send("camera_info", info)
-            time.sleep(0.2)
         sent = 0.0
         stamp = f"{self.stamp:.6f}"
+        lost = ("no joint_states", *(["no camera_info"] if info is not None else []))
+
+        def send():
+            nonlocal sent
+            self.send("joint_states", JointState(name=self.joints, position=list(joints)))
+            if odometry is not None:
+                odom = Odometry()
+                odom.pose.pose = pose_message(odometry)
+                self.send("odom", odom)
+            if info is not None:
+                self.send("camera_info", info)
+                time.sleep(0.2)
+            self.send("image/compressed" if isinstance(message, CompressedImage) else "image", message)
+            sent = time.monotonic()
 
         def answered():
-            nonlocal sent
-            if time.monotonic() - sent > RESEND_S:  # sensor QoS may drop it
-                self.send("image/compressed" if isinstance(message, CompressedImage) else "image", message)
-                sent = time.monotonic()
-            return next(
-                (status for status in self.statuses() if KeyValue(key="image", value=stamp) in status.values), None
-            )
+            if time.monotonic() - sent > RESEND_S:
+                send()
+            reports = self.statuses()
+            status = next((report for report in reports if KeyValue(key="image", value=stamp) in report.values), None)
+            if status and any(text in status.message for text in lost):
+                self.received.clear()
+                send()
+                return None
+            return status
 
         return self.wait(answered, "diagnostics")
 

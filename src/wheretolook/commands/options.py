@@ -119,7 +119,7 @@ def ignore_progress(work: float) -> None:
     """Do nothing: for callers that show no progress."""
 
 
-OUTPUTS = ("out", "floor_plan", "figure", "record", "film")
+OUTPUTS = ("out", "floor_plan", "figure", "record", "film", "nav2")
 """Options that are paths to write; all other paths are inputs."""
 
 
@@ -299,6 +299,24 @@ class CameraOptions(Command):
         if self.camera is not None and self.camera_id is not None:
             raise ConfigError("the camera is described in several ways", value=self.camera, fix="Give one of them.")
         return self.camera_id if self.camera is None else parse_camera(self.camera)
+
+
+@dataclass(frozen=True, kw_only=True)
+class MaskOptions(Command):
+    """A mask for Nav2.
+
+    Args:
+        nav2: also write masks for the costmap filters of Nav2, from the best score at each place: a folder.
+        camera_z: of the camera in a world in metres with z up, for those masks.
+    """
+
+    nav2: Path | None = None
+    camera_z: float | None = None
+
+    def check_height(self) -> None:
+        """Raise ConfigError for a mask without the height of the camera."""
+        problem = "a mask for Nav2 needs the height of the camera: give --camera-z, its z in metres"
+        reject((self.nav2 is not None and self.camera_z is None, problem, str(self.nav2)))
 
 
 @dataclass(frozen=True, kw_only=True)

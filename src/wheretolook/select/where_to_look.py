@@ -231,9 +231,12 @@ class WhereToLook:
             self._space = MappedSpace(self.localization_map.landmarks.points, camera_centers(poses.astype(np.float64)))
         return self._space
 
-    def grid(self, spacing_m: float) -> Waypoints:
-        """Return waypoints so many metres apart in all free space. Raises ConfigError or SceneError if none."""
-        grid = grid_waypoints(self.localization_map, self.space, spacing_m)
+    def grid(self, spacing_m: float, height_m: float | None = None) -> Waypoints:
+        """Return waypoints so many metres apart in all free space, or at one height in the world.
+
+        Raises ConfigError or SceneError if there is none.
+        """
+        grid = grid_waypoints(self.localization_map, self.space, spacing_m, height_m)
         return replace(grid, points=self.frame.world_from_map.inverse.apply(grid.points))
 
     def at_accuracy(self, accuracy: Accuracy) -> WhereToLook:

@@ -241,7 +241,12 @@ def test_a_wall_hides_and_landmarks_are_the_surface_without_a_mesh(half_mapped):
     surface = Surface(scorer.localization_map, MappedSpace(scorer.localization_map.landmarks.points, centers))
     patches = surface.patches(scorer.localization_map.mapping_poses.astype(float), 10, 8)
     assert surface.name == "landmarks" and (patches.shares(np.ones(len(patches.view), bool)) > 0.1).all()
-    np.testing.assert_array_equal(patches.points, scorer.localization_map.landmarks.points[patches.landmark])
+    known = patches.landmark >= 0
+    points = scorer.localization_map.landmarks.points[patches.landmark[known]]
+    np.testing.assert_array_equal(patches.points[known], points)
+    usual_m = np.median(scorer.localization_map.landmarks.mapping_distance_m)  # of surface that no image shows
+    np.testing.assert_allclose(patches.distance_m[~known], usual_m, rtol=1e-6)
+    assert 0.1 < known.mean() < 0.9
 
 
 def test_scores_rise_with_coverage():

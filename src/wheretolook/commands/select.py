@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
-from wheretolook.commands.options import CameraOptions, ScorerOptions, select_options
+from wheretolook.commands.options import CameraOptions, MaskOptions, ScorerOptions, select_options
 from wheretolook.dataset.config import checked_accuracy
 from wheretolook.figures import KINDS
 from wheretolook.geometry.camera import PinholeCamera, describe_camera, parse_size
@@ -19,7 +19,7 @@ from wheretolook.mapping.colmap_model import model_suffix
 from wheretolook.mapping.config import FrameOptions
 from wheretolook.select.waypoints import SelectionRequest, given_waypoints
 from wheretolook.utils.devices import usable_device
-from wheretolook.utils.errors import ConfigError, MapWarning, check_choice
+from wheretolook.utils.errors import ConfigError, MapWarning, check_choice, reject
 
 if TYPE_CHECKING:
     from wheretolook.geometry.camera import Camera
@@ -162,7 +162,7 @@ def finish(command: SelectorOptions, selector: WhereToLook, views: Views, given:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Select(SelectionRequest, SelectorOptions):
+class Select(SelectionRequest, MaskOptions, SelectorOptions):
     """Select the best views at waypoints of your own COLMAP model; needs no dataset.
 
     Waypoints (--at); the format is recognized by the content:
@@ -201,10 +201,12 @@ class Select(SelectionRequest, SelectorOptions):
       wheretolook select --map sparse/0 --at waypoints.csv --sigma 0.5 --yaw-sigma 5 --out views.csv
       wheretolook select --map sparse/0 --at path.tum --rig rig.yaml --out cameras.csv
       wheretolook select --map sparse/0 --grid 0.5 --mesh house.glb --fov 60 --out views.csv
+      wheretolook select --map sparse/0 --grid 0.25 --camera-z 1.2 --scale 1 --nav2 masks --out views.csv
 
     Args:
         at: waypoints: a file, or x,y,z, any number of them.
         grid: instead, waypoints this many metres apart in all free space.
+        camera_z: leave out all of the grid but this z of the camera, in a world in metres with z up.
         directions: number of directions scored at each waypoint.
         lattice: fibonacci (even), or yaw-pitch (ActLoc's 6 x 18).
     """
@@ -230,11 +232,16 @@ class Select(SelectionRequest, SelectorOptions):
         check_format(self.out, self.format, max(self.n, self.looks or 1))
         if self.looks is not None and self.accuracy is not None:
             raise ConfigError("looks are for the accuracy of the weights: leave --accuracy out", value=self.accuracy)
-        if bool(self.at) == (self.grid is not None):
-            raise ConfigError("waypoints are given by either --at or --grid")
+        of_grid = self.nav2 or self.camera_z
+        reject(
+            (bool(self.at) == (self.grid is not None), "waypoints are given by either --at or --grid", None),
+            (bool(self.at and of_grid), "--nav2 and --camera-z need --grid", str(of_grid)),
+        )
 
     def run(self) -> Views:
         """Select the views, write them to `out` and print a summary."""
+        from wheretolook.planning.nav2 import check_mask, write_mask
+
         if self.rig is not None:
             if len(self.at) != 1 or self != replace(self, **vars(SelectionRequest())):
                 fix = "Give --at FILE, and leave --grid, numbers and limits of views out."
@@ -243,10 +250,15 @@ class Select(SelectionRequest, SelectorOptions):
         start = time.monotonic()
         waypoints = self._waypoints()
         selector = self.open_map(directions=self.directions, lattice=self.lattice)
+        if self.nav2:
+            check_mask(selector.scorer, self.camera_z)
         if waypoints is None:
             assert self.grid is not None
-            waypoints = selector.grid(self.grid)
+            waypoints = selector.grid(self.grid, self.camera_z)
         views = selector.select(waypoints, self, progress=True)
+        if self.nav2 and self.grid:
+            best = views[views.rank == 1]
+            write_mask(self.nav2, views.frame.world_from_map.apply(best.positions), best.score, self.grid)
         finish(self, selector, views, len(waypoints), "waypoints")
         print(f"views: {len(views)} in {time.monotonic() - start:.1f} s: {self.out}")
         return views

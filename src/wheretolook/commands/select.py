@@ -228,7 +228,6 @@ class Select(SelectionRequest, MaskOptions, SelectorOptions):
             (bool(self.at) == (self.grid is not None), "waypoints are given by either --at or --grid", None),
             (bool(self.at and of_grid), "--nav2 and --camera-z need --grid", str(of_grid)),
         )
-        self.check_height()
 
     def run(self) -> Views:
         """Select the views, write them to `out` and print a summary."""
@@ -238,7 +237,7 @@ class Select(SelectionRequest, MaskOptions, SelectorOptions):
         waypoints = self._waypoints()
         selector = self.open_map(directions=self.directions, lattice=self.lattice)
         if self.nav2:
-            check_mask(selector.scorer)
+            check_mask(selector.scorer, self.camera_z)
         if waypoints is None:
             assert self.grid is not None
             waypoints = selector.grid(self.grid, self.camera_z)

@@ -67,7 +67,6 @@ class BuildViewpointMap(MappedLattice, MaskOptions, SceneOrMapOptions):
     def __post_init__(self) -> None:
         MappedLattice.__post_init__(self)
         SceneOrMapOptions.__post_init__(self)
-        self.check_height()
 
     @imports_map
     @reads_dataset("viewpoint-map")
@@ -98,7 +97,7 @@ class BuildViewpointMap(MappedLattice, MaskOptions, SceneOrMapOptions):
             with naming_file(scene.folder.source):
                 scorer = scene_scorer(scene, self.method, weights, self.anywhere, self.accuracy)
                 if self.nav2:
-                    check_mask(scorer)
+                    check_mask(scorer, self.camera_z)
                 viewpoint_map = scene_viewpoint_map(scene, self, scorer)
             folder = self.out or files.folder / "viewpoint-map"
             viewpoint_map.save(folder)

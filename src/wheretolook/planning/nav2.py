@@ -14,12 +14,16 @@ from wheretolook.utils.errors import SceneError, reject
 from wheretolook.utils.files import check_output_folder, write_bytes, write_text
 
 
-def check_mask(scorer: Scorer) -> None:
-    """Raise ConfigError if the unit of a scorer's map is unknown, or its scores are no probabilities."""
+def check_mask(scorer: Scorer, camera_z: float | None) -> None:
+    """Raise ConfigError if the height of the camera or the unit of the map is unknown, or scores are no probabilities."""
     is_metric = scorer.localization_map.frame.scale.is_metric
     unknown = "Nav2 needs metres, and the unit of this map is unknown: give --scale, --distance or --positions"
     other = "a mask for Nav2 is of probabilities: use the method set, or another learned one"
-    reject((not is_metric, unknown, None), (not is_probability(scorer.name), other, scorer.name))
+    reject(
+        (camera_z is None, "a mask for Nav2 needs the height of the camera: give --camera-z, its z in metres", None),
+        (not is_metric, unknown, None),
+        (not is_probability(scorer.name), other, scorer.name),
+    )
 
 
 def write_mask(folder: Path, points: Float, probability: Float, cell_m: float) -> None:

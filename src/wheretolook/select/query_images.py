@@ -24,6 +24,7 @@ from wheretolook.geometry.camera import (
     read_named_cameras,
     turn_camera,
 )
+from wheretolook.geometry.camera_files import read_camera
 from wheretolook.geometry.poses import CUBE_FACES, Float
 from wheretolook.localization.rig import FocalPrior
 from wheretolook.mapping.colmap_model import find_camera
@@ -82,7 +83,7 @@ class QueryImages:
         self.upright = reads_upright(opened.path)
 
     def known_camera(self, camera: Camera | int | str | Path | None) -> KnownCamera | None:
-        """Return a camera, given as one, by its camera_id, as a text, or as a file of the cameras of images.
+        """Return a camera, given as one, by its camera_id, as a text, or as a file: of the cameras of images, or of one (YAML, JSON).
 
         "panorama" is an equirectangular camera with as many pixels per degree as the centres of the map's images.
         Raises MapError if the model has no such camera, ConfigError or TableError if the text or the file has none.
@@ -91,7 +92,8 @@ class QueryImages:
             half = round(np.pi * np.median([one.colmap.mean_focal_px for one in self.cameras.values()]))
             return ColmapCamera(EQUIRECTANGULAR, 2 * half, half, (2 * half, half))
         if isinstance(camera, Path) or (isinstance(camera, str) and Path(camera).is_file()):
-            return read_named_cameras(Path(camera))
+            of_all = Path(camera).suffix in (".yaml", ".yml", ".json")
+            return read_camera(Path(camera)) if of_all else read_named_cameras(Path(camera))
         if isinstance(camera, str):
             return parse_camera(camera)
         if camera is not None and not isinstance(camera, (int, Camera)):

@@ -395,7 +395,7 @@ class WhereToLook:
                 text = f"{outside.sum()} of {len(again)} target views are outside this map, or inside its geometry"
                 warnings.warn(f"{self.localization_map.map.path}: {text}", MapWarning, stacklevel=2)
             apart_m = at.apart_m * to_world.scale / at.views.frame.world_from_map.scale
-            return Audit(self._target_views(again, at.views.waypoint, at.views.waypoint_id), apart_m)
+            return Audit(self._target_views(again, at.views.waypoint, at.views.waypoint_id), apart_m, at.space)
         heading = None
         apart_m = 1.0
         if at is None:
@@ -418,7 +418,8 @@ class WhereToLook:
         pitches = pitches_within(request.pitch_deg)
         limits = request.pan_deg or (-180.0, 180.0)
         poses, rows = drawn_views(places, request.views, pitches, heading, limits, request.seed)
-        return Audit(self._target_views(poses, rows, tuple(waypoints.ids[row] for row in rows)), apart_m)
+        space = None if isinstance(self.space, MappedSpace) else self.space
+        return Audit(self._target_views(poses, rows, tuple(waypoints.ids[row] for row in rows)), apart_m, space)
 
     def _target_views(self, poses: Float, rows: NDArray[np.int64], names: Sequence[str]) -> Views:
         """Return views at poses (T, 3, 4) in the world, with rows and names of their places, in the map's own frame."""

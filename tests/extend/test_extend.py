@@ -174,6 +174,19 @@ def test_weak_regions_have_a_cause(half_mapped, counts, cause):
     assert places["region"].tolist() == [0, 1, 1, 2] and places["cause"].tolist() == ["", cause, cause, cause]
 
 
+def test_a_wall_separates_weak_regions(half_mapped):
+    poses = poses_looking_along(np.array([(1.0, 2, 1.5), (2, 2, 1.5), (3, 2, 1.5)]), (0.0, 1.0, 0.0))
+    few = dict.fromkeys(("n_visible", "n_too_far", "n_too_oblique", "n_repeated"), np.zeros(3))
+    frame = half_mapped[0].localization_map.frame
+    views = Views(
+        poses, CAMERA, "set", frame, waypoint=np.arange(3), waypoint_id=("a", "b", "c"), score=few["n_visible"], **few
+    )
+    wall = [[(2.5, 0.0, 0.0), (2.5, 5.0, 0.0), (2.5, 5.0, 3.0), (2.5, 0.0, 3.0)]]
+    space = FreeSpace(box_room(SIZE, more_quads=wall, more_textures=[np.zeros((4, 4, 3), np.uint8)]))
+    assert Audit(views, 1.0).places()["region"].nunique() == 1
+    assert Audit(views, 1.0, space).places()["region"].tolist() == [1, 1, 2]
+
+
 def test_one_place_has_no_interval():
     assert percent(0.5, np.nan, np.nan) == "50.0 %"
 

@@ -105,6 +105,7 @@ class ImageLocalizer:
     pairs: ImagePairs | None = None
     lightglue: str = ""  # as in `LocalizerConfig`
     features: Path | None = None  # of the mapping images, which LightGlue matches
+    photographs: bool = False  # whether the mapping images are photographs
 
     @classmethod
     def open(
@@ -130,7 +131,17 @@ class ImageLocalizer:
         features = database or (find_features(path) if lightglue or learned else None)
         extractor = extractor or extractor_of(path, KINDS[landmarks.features])
         of_images = None if pairs is None else ImagePairs.read(pairs, opened.images)
-        result = cls(landmarks, opened.frame, QueryImages(opened), extractor, device, of_images, lightglue, features)
+        result = cls(
+            landmarks,
+            opened.frame,
+            QueryImages(opened),
+            extractor,
+            device,
+            of_images,
+            lightglue,
+            features,
+            opened.has_photographs,
+        )
         _ = (
             result._localizer.extractor,
             result.features_from,
@@ -174,7 +185,9 @@ class ImageLocalizer:
         config = LocalizerConfig(method="hypotheses", lightglue=self.lightglue)
         camera = next(iter(self.images.cameras.values()))
         map_dir = self.images.folder
-        return Localizer(self.landmarks, camera, config, self.extractor, self.device, map_dir, self.features)
+        return Localizer(
+            self.landmarks, camera, config, self.extractor, self.device, map_dir, self.features, self.photographs
+        )
 
     @cached_property
     def _rigs(self) -> JointLocalizer:
@@ -227,10 +240,7 @@ class ImageLocalizer:
         near = None if prior is None else PosePrior.of(prior, self.frame.world_from_map)
         limits = checked_accuracy(accuracy, self.landmarks.mapping_distance_m)
         exact = self._localizer.joint  # rotations
-        if any(is_panorama(query.camera) for query in queries):
-            if len(queries) > 1:
-                problem = "a panorama is not localized together with other images"
-                raise ConfigError(problem, value=names, fix="Leave the turns out.")
+        if len(queries) == 1 and is_panorama(queries[0].camera):
             faces, cam_from_rig = cut_panorama(queries[0])
             if near is not None:
                 near = replace(near, yaw_deg=None)  # faces look all around

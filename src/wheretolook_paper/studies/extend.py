@@ -23,12 +23,13 @@ import pandas as pd
 from jsonargparse import auto_cli
 from numpy.typing import NDArray
 
+from wheretolook.dataset.config import LOCALIZED
 from wheretolook.dataset.scene import ColmapFiles, Scene
 from wheretolook.extend.config import TargetOptions
 from wheretolook.extend.places import camera_places, drawn_views, photograph_candidates
 from wheretolook.extend.plan import Planner
 from wheretolook.features.extractor import ExtractorConfig, KeypointExtractor, Keypoints, kind_of
-from wheretolook.geometry.camera import PinholeCamera
+from wheretolook.geometry.camera import Camera, PinholeCamera
 from wheretolook.geometry.poses import Float, camera_centers, pose_error, poses_looking_along
 from wheretolook.localization.confidence import RIGHT_PLACE_LIMITS
 from wheretolook.localization.localizer import Localizer
@@ -120,14 +121,17 @@ def map_of(photographs: list[Photograph], camera: PinholeCamera, folder: Path, s
 
 
 def errors_in(folder: Path, photographs: list[Photograph], camera: PinholeCamera) -> Float:
-    """Return errors (T, 2), in metres and degrees, of photographs localized in a map; infinite for those that are not."""
+    """Return errors (T, 2), in metres and degrees, of photographs localized in a map."""
     localizer = Localizer(Landmarks.load(folder / "landmarks.npz"), camera)
-    errors = np.full((len(photographs), 2), np.inf)
-    for row, photograph in enumerate(photographs):
-        result = localizer.estimate(photograph.keypoints, localizer.match([photograph.keypoints])[0])
-        if result.status == "localized" and result.cam_from_world is not None:
-            errors[row] = pose_error(result.cam_from_world, photograph.pose)
-    return errors
+    return np.array([error_of(localizer, one.keypoints, one.pose) for one in photographs]).reshape(-1, 2)
+
+
+def error_of(localizer: Localizer, keypoints: Keypoints, pose: Float, camera: Camera | None = None) -> Float:
+    """Return the error (2,) of an image in metres and degrees; infinite if it does not localize."""
+    result = localizer.estimate(keypoints, localizer.match([keypoints])[0], camera)
+    if result.status != LOCALIZED or result.cam_from_world is None:
+        return np.full(2, np.inf)
+    return np.array(pose_error(result.cam_from_world, pose))
 
 
 def spread(policy: str, planner: Planner, n: int, seed: int) -> Float:

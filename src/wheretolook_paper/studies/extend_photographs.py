@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from wheretolook.extend.audit import Audit
 from wheretolook.extend.plan import Planner
 from wheretolook.features.extractor import Keypoints
-from wheretolook.geometry.poses import Float, pose_error
+from wheretolook.geometry.poses import Float
 from wheretolook.geometry.views import Views
 from wheretolook.holdout.holdout import without
 from wheretolook.holdout.photo_map import MAX_ERROR_M, PhotographedMap, open_map
@@ -34,7 +34,7 @@ from wheretolook.mapping.landmarks import load_colmap_landmarks
 from wheretolook.select.where_to_look import WhereToLook
 from wheretolook.utils.errors import MapError, MapWarning
 from wheretolook_paper.evaluation.comparison import replace_rows
-from wheretolook_paper.studies.extend import row_of, spread
+from wheretolook_paper.studies.extend import error_of, row_of, spread
 
 Rows = NDArray[np.int64]
 
@@ -55,20 +55,18 @@ class Photographs:
     def errors(self, rows: Rows, tested: Rows) -> Float:
         """Return errors (T, 2) of tested photographs in a map of others, scaled so that one limit serves all."""
         source = self.source
-        errors = np.full((len(tested), 2), np.inf)
         with warnings.catch_warnings(action="ignore", category=MapWarning):
             landmarks = load_colmap_landmarks(
                 source.path, source.features, None, "cpu", self.reduced(rows), progress=False
             )
         localizer = Localizer(landmarks, source.cameras[0])
-        for number, row in enumerate(tested.tolist()):
+        errors = []
+        for row in tested.tolist():
             pixels, descriptors = self.stored[row]
             keypoints = Keypoints(pixels, self.kind.restore(descriptors))
-            result = localizer.estimate(keypoints, localizer.match([keypoints])[0], source.cameras[row])
-            if result.status == "localized" and result.cam_from_world is not None:
-                errors[number] = pose_error(result.cam_from_world, source.poses[row])
-        errors[:, 0] *= MAX_ERROR_M / source.limit_m[tested]
-        return errors
+            error = error_of(localizer, keypoints, source.poses[row], source.cameras[row])
+            errors.append(error * (MAX_ERROR_M / source.limit_m[row], 1))
+        return np.array(errors)
 
     def planner(self, folder: Path, base: Rows, rest: Rows) -> Planner:
         """Return a planner of a map of some photographs, whose candidates and target views are the others."""

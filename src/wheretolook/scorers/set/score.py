@@ -46,6 +46,7 @@ from wheretolook.training.trained_network import (
     camera_quantities,
     view_quantities,
 )
+from wheretolook.utils.errors import MapWarning
 from wheretolook.utils.processes import cores
 from wheretolook.visibility.counting import FrustumLister, ListedViews, Surroundings, choose_size
 from wheretolook.visibility.frustum import LandmarkSets
@@ -263,14 +264,14 @@ class LandmarkScorer(Scorer):
         self.training_range = TrainingRange.of_camera(camera) if training_range is None else training_range
         self.describer = LandmarkDescriber(localization_map, attributes)
         self._of_camera = camera_quantities(localization_map.camera)
-        self._serves_camera = bool(self.training_range.contains(self._of_camera[None])[0])
-        self._watch = RangeWatch(self.training_range.bounds_landmarks or not self._serves_camera)
+        self.serves_camera = bool(self.training_range.contains(self._of_camera[None])[0])
+        self._watch = RangeWatch(self.training_range.bounds_landmarks or not self.serves_camera)
 
     def in_range(self, cam_from_world: Float) -> NDArray[np.bool_]:
         """Return which poses (B, 3, 4) have views like the training views, (B,) bool."""
         cam_from_world = check_poses(cam_from_world)
-        inside = np.full(len(cam_from_world), self._serves_camera)
-        if self._serves_camera and self.training_range.bounds_landmarks:
+        inside = np.full(len(cam_from_world), self.serves_camera)
+        if self.serves_camera and self.training_range.bounds_landmarks:
             for rows, described, n_visible in self.describer.in_blocks(cam_from_world, self.max_landmarks):
                 inside[rows] = self._in_range(described, n_visible)
         return inside
@@ -328,7 +329,11 @@ def error_scale(localization_map: LocalizationMap) -> float:
     """
     whole = localization_map.map.whole or localization_map.map
     if "error_scale" not in whole.computed:
-        noise_px = max(0.1, whole.landmarks.keypoint_noise_px)
+        noise_px = whole.landmarks.keypoint_noise_px
+        if noise_px is None:
+            text = "no landmark has a reprojection error: keypoints count as precise to a pixel"
+            warnings.warn(f"{whole.path or 'map'}: {text}", MapWarning, stacklevel=2)
+        noise_px = max(0.1, noise_px or 1.0)
         ratio = None if whole.images is None else log_error_ratio(whole.images, whole.cameras, noise_px)
         whole.computed["error_scale"] = noise_px * (1.0 if ratio is None else exp(0.4 * (ratio - 0.27)))
     return float(whole.computed["error_scale"])
@@ -454,7 +459,7 @@ class SetScorer(LandmarkScorer):
         expected_inliers = np.zeros(n)
         errors = np.empty((n, 2))
         n_visible = np.zeros(n, dtype=np.int64)
-        in_range = np.full(n, self._serves_camera)
+        in_range = np.full(n, self.serves_camera)
         out_of_range = np.full(n, "", dtype=object)
         for rows, described, visible in self.describer.in_blocks(cam_from_world, MAX_LANDMARKS):
             views = self.network.sums_of(described, visible)

@@ -174,6 +174,19 @@ def test_weak_regions_have_a_cause(half_mapped, counts, cause):
     assert places["region"].tolist() == [0, 1, 1, 2] and places["cause"].tolist() == ["", cause, cause, cause]
 
 
+def test_a_wall_separates_weak_regions(half_mapped):
+    poses = poses_looking_along(np.array([(1.0, 2, 1.5), (2, 2, 1.5), (3, 2, 1.5)]), (0.0, 1.0, 0.0))
+    few = dict.fromkeys(("n_visible", "n_too_far", "n_too_oblique", "n_repeated"), np.zeros(3))
+    frame = half_mapped[0].localization_map.frame
+    views = Views(
+        poses, CAMERA, "set", frame, waypoint=np.arange(3), waypoint_id=("a", "b", "c"), score=few["n_visible"], **few
+    )
+    wall = [[(2.5, 0.0, 0.0), (2.5, 5.0, 0.0), (2.5, 5.0, 3.0), (2.5, 0.0, 3.0)]]
+    space = FreeSpace(box_room(SIZE, more_quads=wall, more_textures=[np.zeros((4, 4, 3), np.uint8)]))
+    assert Audit(views, 1.0).places()["region"].nunique() == 1
+    assert Audit(views, 1.0, space).places()["region"].tolist() == [1, 1, 2]
+
+
 def test_one_place_has_no_interval():
     assert percent(0.5, np.nan, np.nan) == "50.0 %"
 
@@ -241,7 +254,12 @@ def test_a_wall_hides_and_landmarks_are_the_surface_without_a_mesh(half_mapped):
     surface = Surface(scorer.localization_map, MappedSpace(scorer.localization_map.landmarks.points, centers))
     patches = surface.patches(scorer.localization_map.mapping_poses.astype(float), 10, 8)
     assert surface.name == "landmarks" and (patches.shares(np.ones(len(patches.view), bool)) > 0.1).all()
-    np.testing.assert_array_equal(patches.points, scorer.localization_map.landmarks.points[patches.landmark])
+    known = patches.landmark >= 0
+    points = scorer.localization_map.landmarks.points[patches.landmark[known]]
+    np.testing.assert_array_equal(patches.points[known], points)
+    usual_m = np.median(scorer.localization_map.landmarks.mapping_distance_m)  # of surface that no image shows
+    np.testing.assert_allclose(patches.distance_m[~known], usual_m, rtol=1e-6)
+    assert 0.1 < known.mean() < 0.9
 
 
 def test_scores_rise_with_coverage():

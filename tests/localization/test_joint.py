@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from wheretolook.features.matches import Matches
 from wheretolook.geometry.camera import ColmapCamera, PinholeCamera
 from wheretolook.geometry.poses import camera_centers, compose_poses, pose_error, poses_looking_along, transform
+from wheretolook.localization.confidence import ERRORS_ON_PHOTOGRAPHS, RIGHT_PLACE
 from wheretolook.localization.config import LocalizerConfig
 from wheretolook.localization.estimation import (
     PoseAmbiguity,
@@ -111,6 +112,24 @@ def test_several_looks_are_more_accurate_and_the_deviation_is_calibrated():
     rms = np.sqrt(np.mean(np.square(errors)))
     assert rms < 0.5 * np.sqrt(np.mean(np.square(single)))
     assert 0.7 < rms / np.mean(deviations) < 1.4
+
+
+def test_deviations_on_photographs_are_larger_by_one_factor_and_probabilities_follow():
+    """An error above a limit is as probable as one above the limit over the factor on a map of renders."""
+    points = a_room()
+    _, looks, _ = looks_from(points, seed=3, noise_px=1.0, n=30)
+    rendered, photographed = (
+        JointLocalizer(PoseEstimator(points, photographs=photographs)).localize(looks) for photographs in (False, True)
+    )
+    assert_array_equal(photographed.rig_from_world, rendered.rig_from_world)
+    factor = ERRORS_ON_PHOTOGRAPHS
+    assert_allclose(photographed.deviation, factor * np.array(rendered.deviation))
+    place = rendered.probability(RIGHT_PLACE)
+    assert photographed.probability(RIGHT_PLACE) == pytest.approx(place)
+    limits = (2 * rendered.deviation[0], 2 * rendered.deviation[1])
+    assert photographed.probability(limits) < rendered.probability(limits) < place
+    larger = (factor * limits[0], factor * limits[1])
+    assert photographed.probability(larger) == pytest.approx(rendered.probability(limits))
 
 
 def test_one_look_is_localized_exactly_as_a_single_image():

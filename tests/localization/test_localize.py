@@ -14,8 +14,9 @@ from scipy.spatial.transform import Rotation
 
 from localization.rooms import CAMERA
 from wheretolook.cli import main
-from wheretolook.geometry.camera import PinholeCamera
-from wheretolook.geometry.poses import pose_error, poses_looking_along
+from wheretolook.commands.localize import Localize
+from wheretolook.geometry.camera import ColmapCamera, PinholeCamera
+from wheretolook.geometry.poses import compose_poses, pose_error, poses_looking_along
 from wheretolook.geometry.similarity import Similarity
 from wheretolook.geometry.views import Views
 from wheretolook.localization.rig import checked_turns, read_turns
@@ -27,6 +28,7 @@ from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.scenes.loading import load_mesh
 from wheretolook.select.image_localizer import ImageLocalizer
 from wheretolook.select.localized import figure_of
+from wheretolook.select.query_images import cut_panorama
 from wheretolook.select.where_to_look import WhereToLook
 from wheretolook.utils.errors import ConfigError, MapError, PoseError, TableError
 
@@ -369,3 +371,57 @@ def test_rounded_rotations_are_made_orthonormal():
     poses = checked_turns(np.round([np.eye(3), exact], 4), 2)
     assert_allclose(poses[:, :, :3] @ poses[:, :, :3].swapaxes(1, 2), [np.eye(3)] * 2, atol=1e-12)
     assert_allclose(poses[1, :, :3], exact, atol=1e-4)
+
+
+@pytest.fixture(scope="module")
+def panoramas(room, tmp_path_factory):
+    """Rendered panoramas of two places near the plain wall, of 2 pixels per degree, with their poses."""
+    poses = poses_looking_along([(3.4, 1.2, 1.1), (4.2, 2.0, 1.3)], [(0.4, 1, 0), (0.7, -1, 0.1)])
+    camera = ColmapCamera("EQUIRECTANGULAR", 720, 360, (720.0, 360.0))
+    folder = tmp_path_factory.mktemp("panoramas")
+    for name, rgb in zip("ab", WarpRenderer(load_mesh(room.mesh)).render(camera, poses).rgb, strict=True):
+        cv2.imwrite(str(folder / f"{name}.png"), rgb[..., ::-1])
+    return folder, poses
+
+
+def test_a_panorama_is_localized_jointly_where_half_of_its_cut_outs_are(room, panoramas, localizer, tmp_path):
+    folder, poses = panoramas
+    out = tmp_path / "images.txt"
+    command = ["localize", "--panorama", str(folder), "--map", str(room.landmarks.parent), "--out", str(out)]
+    assert main([*command, "--figure", str(tmp_path / "figures")]) == 0
+    found = Views.read(out)
+    assert found.waypoint_id == ("a.png", "b.png")
+    error_m, error_deg = pose_error(found.cam_from_world, poses)
+    assert (error_m < 0.02).all() and (error_deg < 0.2).all()
+    assert {path.name for path in (tmp_path / "figures").iterdir()} == {"a.png", "b.png"}
+    panorama = localizer.images.read(folder / "a.png", "a.png", localizer.images.known_camera("panorama"))
+    faces, cam_from_rig = cut_panorama(panorama)
+    right = 0
+    for face, pose in zip(faces, cam_from_rig, strict=True):
+        alone = localizer.localize(face.rgb, camera=face.camera)
+        if alone.cam_from_world is not None:
+            error_m, error_deg = pose_error(alone.cam_from_world, compose_poses(pose, poses[:1]))
+            right += bool(error_m[0] < 0.02 and error_deg[0] < 0.2)
+    assert 1 <= right <= 3
+
+
+def test_faces_of_a_panorama_show_what_cameras_along_their_axes_see(room, panoramas, localizer):
+    folder, poses = panoramas
+    panorama = localizer.images.read(folder / "a.png", "a.png", ColmapCamera("EQUIRECTANGULAR", 720, 360, (720, 360)))
+    faces, cam_from_rig = cut_panorama(panorama)
+    assert_allclose(cam_from_rig[0], np.eye(3, 4), atol=1e-12)
+    renderer = WarpRenderer(load_mesh(room.mesh))
+    for face, pose in zip(faces, compose_poses(cam_from_rig, poses[0]), strict=True):
+        expected = renderer.render(face.camera, pose[None]).rgb[0]
+        smooth = [cv2.GaussianBlur(rgb.astype(np.float32), (0, 0), 2) for rgb in (face.rgb, expected)]
+        assert np.abs(smooth[0] - smooth[1]).mean() < 2
+
+
+def test_what_is_no_panorama_is_refused_with_the_fix(room, photos, localizer):
+    folder = str(room.landmarks.parent)
+    with pytest.raises(ConfigError, match=r"320 x 240 px is no equirectangular panorama.*twice as wide as high"):
+        localizer.localize(photos / "a.png", camera="panorama")
+    with pytest.raises(ConfigError, match="either --images or --panorama"):
+        Localize(map=folder)
+    with pytest.raises(ConfigError, match="Leave --turns"):
+        Localize(map=folder, panorama=(photos / "a.png",), next=True)

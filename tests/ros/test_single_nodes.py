@@ -16,8 +16,9 @@ pytest.importorskip("rclpy", reason="ROS is not installed: pip install '.[ros]'"
 import rclpy
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticStatus
-from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, Vector3Stamped
-from nav_msgs.msg import Path as PathMessage
+from geometry_msgs.msg import Point, Pose, PoseStamped, PoseWithCovarianceStamped, TransformStamped, Vector3Stamped
+from nav_msgs.msg import OccupancyGrid, Path as PathMessage
+from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 from wheretolook_ros.conversions import pose_matrix, pose_message
@@ -26,6 +27,7 @@ from wheretolook_ros.head import Head, Timeline
 from ros.processes import CAMERA, HEAD, JOINTS, Robot, base_at, environment, image_of, info_of, running
 from ros.room import room_mesh
 from wheretolook.geometry.poses import compose_poses, invert_poses, pan_tilt_angles
+from wheretolook.planning.nav2 import write_mask
 from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.robot.wheretolook_robot import RobotScorer
 
@@ -245,3 +247,43 @@ def test_the_gaze_of_a_head_with_one_joint(node, folder, moved):
             assert gaze.score(base, joints(angle)) >= np.max(others) - 0.02
         pan, tilt = pan_tilt_angles(gaze.views()[:, :, 2])
         np.testing.assert_allclose(pan if moved else -tilt, 0.0 if moved else fixed[1], atol=1e-6)
+
+
+def test_odometry_is_placed_in_the_map(node, folder):
+    found = []
+    topic = "visual_localization/map_from_odom"  # where tf2_msgs is not installed
+    node.create_subscription(TransformStamped, topic, found.append, 10)
+    odometry = compose_poses(base_at(-1.0, 4.0, 50.0), BASE)  # its origin is elsewhere
+    with running(LOCALIZER, {"folder": folder, "publish_tf": "true", "odom_frame": "wheels"}):
+        node.connected("image", "camera_info", "odom", "joint_states")
+        assert node.see(image_of(node.rgb(BASE)), info_of(CAMERA), odometry).message == "localized"
+        node.wait(lambda: len(found) > 3, "transforms")
+    sent = found[-1]
+    assert (sent.header.frame_id, sent.child_frame_id) == ("map", "wheels")
+    moved = sent.transform.translation
+    pose = Pose(position=Point(x=moved.x, y=moved.y, z=moved.z), orientation=sent.transform.rotation)
+    base = compose_poses(pose_matrix(pose), odometry)
+    np.testing.assert_allclose(base, BASE, atol=0.02)
+    assert len({(one.header.stamp.sec, one.header.stamp.nanosec) for one in found}) == len(found)
+
+
+def test_localizability_is_latched_and_a_robot_turns_to_the_view(node, folder, tmp_path):
+    places = np.array([(1.0, 2.0, 1.2), (1.5, 2.0, 1.2), (1.0, 3.0, 1.2)])
+    write_mask(tmp_path / "mask", places, np.array([0.2, 0.996, 0.5]), 0.5)
+    turning = {"pan_joint": '""', "tilt_joint": '""'}
+    with running(GAZE, {"folder": folder, "mask": tmp_path / "mask"} | turning):
+        gaze = Gaze(node, folder)
+        grids, goals = [], []
+        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        node.create_subscription(OccupancyGrid, "localizability", grids.append, latched)
+        node.create_subscription(PoseStamped, "gaze/goal_pose", goals.append, 10)
+        grid = node.wait(lambda: grids and grids[0], "the latched grid")
+        _, _, direction = gaze.joints(BASE)
+        goal = node.wait(lambda: (gaze.joints(BASE), goals)[1], "a goal")[-1]
+    assert grid.header.frame_id == "map" and (grid.info.width, grid.info.height) == (2, 3)
+    origin = grid.info.origin.position
+    assert (origin.x, origin.y, round(grid.info.resolution, 6)) == (0.75, 1.75, 0.5)
+    assert list(grid.data) == [20, 100, -1, -1, 50, -1]
+    assert goal.header.frame_id == "base_link" and (goal.header.stamp.sec, goal.pose.position.x) == (0, 0.0)
+    forward = pose_matrix(goal.pose)[:, 0]
+    np.testing.assert_allclose(forward[:2], np.array(direction)[:2] / np.linalg.norm(direction[:2]), atol=1e-6)

@@ -111,7 +111,7 @@ def test_a_sequence_and_a_grid(sparse, at):
     [
         "--at at.csv", "--map nowhere --at at.csv", "--map SPARSE", "--map SPARSE --at at.csv --grid 1",
         "--map SPARSE --at gone.csv", "--map SPARSE --at 1,2,300", "--map SPARSE --at at.csv --format xml",
-        "--map SPARSE --at at.csv --camera MAGIC,1,2", "--map SPARSE --at at.csv --fov 60 --camera-id 1",
+        "--map SPARSE --at at.csv --camera MAGIC,1,2", "--map SPARSE --at at.csv --camera at.csv", "--map SPARSE --at at.csv --fov 60 --camera-id 1",
         "--map SPARSE --at at.csv --fov 60 --size big", "--map SPARSE --at at.csv --nn 2",
         "--map SPARSE --at 1 2 1.5", "--map SPARSE --at at.csv --mesh-up y",
     ],

@@ -25,8 +25,8 @@ class Extend(TargetOptions, SelectorOptions):
 
     Where the robot will be (--targets): a file of `wheretolook select --at`, or x,y,z, any number of them; by default all
     free space at --height. Photographs are anywhere in free space, by --mesh or --depth, or else near the mapping cameras,
-    and are planned for the map's camera. Without mesh or depth, the surface is known only at landmarks: `extend` then
-    proposes second views of weakly mapped surface, and cannot plan for unmapped rooms.
+    and are planned for the map's camera. Without mesh or depth, the surface is known only at landmarks, and
+    elsewhere assumed at their usual distance: unmapped rooms cannot be planned for.
 
     Columns of --out (formats as of `wheretolook select`): gain in the predicted share of target views that localize; share
     after the photograph, with the 95 % interval over places; p_registers, the probability that the photograph registers;

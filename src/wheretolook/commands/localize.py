@@ -27,7 +27,9 @@ if TYPE_CHECKING:
 class Localize(CameraOptions, FrameOptions):
     """Localize images in a COLMAP or hloc map; needs no dataset and no weights.
 
-    Each image is localized alone, or with --turns all as one rig: views from one location, with known rotations.
+    Each image is localized alone, or with --turns all as one rig: views from one location, with known rotations. An
+    equirectangular image (--panorama) is cut into a rig of six pinholes, and has the pose of its centre: x right, y down,
+    z forward.
 
     Map: its descriptors are those of a COLMAP database or of hloc's features in HDF5, by default the ones in the model's
     folder or above it. Images are described by the extractor of these.
@@ -53,11 +55,13 @@ class Localize(CameraOptions, FrameOptions):
     Examples:
       wheretolook localize --map sparse/0 --images query.jpg --out pose.csv --figure pose.png
       wheretolook localize --map sparse/0 --images queries --out images.txt
+      wheretolook localize --map sparse/0 --panorama street.jpg --out pose.csv
       wheretolook localize --map sparse/0 --images a.jpg b.jpg --turns turns.csv --scale 1 --out pose.json --next
 
     Args:
         map: folder of a COLMAP model.
         images: images, or folders of them; also without --images, before the other options.
+        panorama: instead, equirectangular images of 360 x 180 degrees, twice as wide as high, or folders of them.
         turns: rotations of the images, which are then localized together.
         out: file of the poses: .csv, .json or images.txt.
         figure: also draw matches, pose and rivals: a file .png, .pdf or .svg; for several images a folder.
@@ -80,7 +84,8 @@ class Localize(CameraOptions, FrameOptions):
     SHORT: ClassVar = {"pitch": "pitch_deg", "pan": "pan_deg"}
 
     map: Path
-    images: tuple[Path, ...]
+    images: tuple[Path, ...] = ()
+    panorama: tuple[Path, ...] = ()
     turns: Path | None = None
     out: Path | None = None
     figure: Path | None = None
@@ -99,6 +104,11 @@ class Localize(CameraOptions, FrameOptions):
     def __post_init__(self) -> None:
         self.frame_options()
         self._query_camera()
+        if bool(self.images) == bool(self.panorama):
+            raise ConfigError("images are given by either --images or --panorama", value=self.images or None)
+        if self.panorama and (self.turns or self.camera or self.camera_id is not None or self.next):
+            fix = "Leave --turns, --camera, --camera-id and --next out."
+            raise ConfigError("a panorama has a known camera and all directions", value=self.panorama, fix=fix)
         checked_accuracy(self.accuracy)
         if self.figure is not None and self.figure.suffix:
             check_choice("format of figures", self.figure.suffix[1:].lower(), KINDS)
@@ -110,8 +120,10 @@ class Localize(CameraOptions, FrameOptions):
     def _extractor(self) -> ExtractorConfig | None:
         return None if self.extractor is None else ExtractorConfig(self.extractor, weights=self.extractor_weights)
 
-    def _query_camera(self) -> Camera | int | Path | None:
-        """Return the camera of all images, its camera_id, or the file of the cameras of images."""
+    def _query_camera(self) -> Camera | int | str | Path | None:
+        """Return the camera of all images, its camera_id, the file of the cameras of images, or "panorama"."""
+        if self.panorama:
+            return "panorama"
         if self.camera is not None and self.camera_id is None and Path(self.camera).is_file():
             return Path(self.camera)
         return self.named_camera()
@@ -162,7 +174,7 @@ class Localize(CameraOptions, FrameOptions):
     def _paths(self) -> list[Path]:
         """Return the files of all images. Raises MapError if one is missing, or a folder has none."""
         paths: list[Path] = []
-        for path in self.images:
+        for path in self.images or self.panorama:
             found = [path] if path.is_file() else find_photograph_files(path)
             if not found:
                 fix = f"Give images, or folders of images that end in {', '.join(SUFFIXES)}."

@@ -14,7 +14,8 @@ from wheretolook.dataset.config import RELEASE_FILE, SampleConfig
 from wheretolook.dataset.layout import Dataset
 from wheretolook.dataset.scene import Scene
 from wheretolook.features.extractor import ExtractorConfig
-from wheretolook.geometry.camera import Camera, CameraConfig, describe_camera, parse_camera
+from wheretolook.geometry.camera import Camera, CameraConfig, describe_camera
+from wheretolook.geometry.camera_files import described_camera
 from wheretolook.localization.config import LabelConfig
 from wheretolook.mapping.config import MapConfig
 from wheretolook.scenes.config import ApartmentConfig, SceneKind
@@ -119,7 +120,7 @@ def ignore_progress(work: float) -> None:
     """Do nothing: for callers that show no progress."""
 
 
-OUTPUTS = ("out", "floor_plan", "figure", "record", "film")
+OUTPUTS = ("out", "floor_plan", "figure", "record", "film", "nav2")
 """Options that are paths to write; all other paths are inputs."""
 
 
@@ -287,7 +288,8 @@ class CameraOptions(Command):
     """The camera of the views.
 
     Args:
-        camera: COLMAP's MODEL,width,height,parameters, such as PINHOLE,640,480,320,320,320,240; by default the map's.
+        camera: COLMAP's MODEL,width,height,parameters, such as PINHOLE,640,480,320,320,320,240; or a file: ROS's
+            camera_info, OpenCV's calibration (YAML), nerfstudio's transforms.json. By default the map's.
         camera_id: instead, the camera_id of one of the map's cameras.
     """
 
@@ -298,7 +300,20 @@ class CameraOptions(Command):
         """Return the camera asked for: one, a camera_id of the map, or None for the map's own."""
         if self.camera is not None and self.camera_id is not None:
             raise ConfigError("the camera is described in several ways", value=self.camera, fix="Give one of them.")
-        return self.camera_id if self.camera is None else parse_camera(self.camera)
+        return self.camera_id if self.camera is None else described_camera(self.camera)
+
+
+@dataclass(frozen=True, kw_only=True)
+class MaskOptions(Command):
+    """A mask for Nav2.
+
+    Args:
+        nav2: also write masks for the costmap filters of Nav2, from the best score at each place: a folder.
+        camera_z: of the camera in a world in metres with z up, for those masks.
+    """
+
+    nav2: Path | None = None
+    camera_z: float | None = None
 
 
 @dataclass(frozen=True, kw_only=True)

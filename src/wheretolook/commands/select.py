@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
-from wheretolook.commands.options import CameraOptions, ScorerOptions
+from wheretolook.commands.options import CameraOptions, MaskOptions, ScorerOptions, select_options
 from wheretolook.dataset.config import checked_accuracy
 from wheretolook.figures import KINDS
 from wheretolook.geometry.camera import PinholeCamera, describe_camera, parse_size
@@ -19,7 +19,7 @@ from wheretolook.mapping.colmap_model import model_suffix
 from wheretolook.mapping.config import FrameOptions
 from wheretolook.select.waypoints import SelectionRequest, given_waypoints
 from wheretolook.utils.devices import usable_device
-from wheretolook.utils.errors import ConfigError, MapWarning, check_choice
+from wheretolook.utils.errors import ConfigError, MapWarning, check_choice, reject
 
 if TYPE_CHECKING:
     from wheretolook.geometry.camera import Camera
@@ -109,6 +109,7 @@ class SelectorOptions(OpenOptions):
         out: file of the views; its ending decides the format.
         format: csv, json, tum, colmap or benchmark.
         floor_plan: also draw the views on a plan of the landmarks: a file .png, .pdf or .svg.
+        rig: score all cameras of a rig: a rig_id of the model, or a file as docs/rigs.md describes.
         frame: whose orientations a trajectory or table holds: base (x forward, z up) or camera (z forward). By default
             that of a base if all its z axes are within 45 degrees of up.
     """
@@ -117,9 +118,13 @@ class SelectorOptions(OpenOptions):
     format: str | None = None
     frame: Literal["base", "camera"] | None = None
     floor_plan: Path | None = None
+    rig: str | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if self.rig is not None and (self.accuracy is not None or self.named_camera() is not None):
+            fix = "Leave cameras and the accuracy out."
+            raise ConfigError("a rig has its own cameras, and the accuracy of the weights", value=self.rig, fix=fix)
         if self.floor_plan is not None:
             check_choice("format of figures", self.floor_plan.suffix[1:].lower(), KINDS)
 
@@ -136,7 +141,7 @@ def finish(command: SelectorOptions, selector: WhereToLook, views: Views, given:
     localization_map = selector.localization_map
     if views.read_as is not None:
         print(f"{locations} read as {views.read_as[0]}")
-    camera = "that of each image" if views.camera is None else describe_camera(views.camera)
+    camera = "that of each view" if views.camera is None else describe_camera(views.camera)
     print(f"{selector.frame.describe()}; camera: {camera}")
     n_used = len({*views.waypoint.tolist()})
     skipped = f", {given - n_used} left out" if n_used < given else ""
@@ -157,7 +162,7 @@ def finish(command: SelectorOptions, selector: WhereToLook, views: Views, given:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Select(SelectionRequest, SelectorOptions):
+class Select(SelectionRequest, MaskOptions, SelectorOptions):
     """Select the best views at waypoints of your own COLMAP model; needs no dataset.
 
     Waypoints (--at); the format is recognized by the content:
@@ -181,6 +186,9 @@ class Select(SelectionRequest, SelectorOptions):
       tum          t x y z qx qy qz qw, camera-to-world
       colmap       images.txt, world-to-camera; if --out is a folder, cameras.txt and an empty points3D.txt too
       benchmark    "# id qw qx qy qz tx ty tz", world-to-camera
+    Rig (--rig): all its cameras are scored at poses of the rig (--at FILE, as --poses of `wheretolook score`), which has the
+    axes of its reference camera. A row for each camera, rank 1 for the best; sensor: its name; any_score: probability that at
+    least one localizes alone; set_score: that all do jointly.
     A view that is not in_range is outside the training distribution of the weights: its score is less reliable.
 
     Examples:
@@ -191,11 +199,14 @@ class Select(SelectionRequest, SelectorOptions):
       wheretolook select --map sparse/0 --at path.tum --max-turn 30 --looks 3 --least-score 0.7 --out views.csv
       wheretolook select --map sparse/0 --at path.tum --pan -60 60 --n 3 --apart 20 --out views.csv
       wheretolook select --map sparse/0 --at waypoints.csv --sigma 0.5 --yaw-sigma 5 --out views.csv
+      wheretolook select --map sparse/0 --at path.tum --rig rig.yaml --out cameras.csv
       wheretolook select --map sparse/0 --grid 0.5 --mesh house.glb --fov 60 --out views.csv
+      wheretolook select --map sparse/0 --grid 0.25 --camera-z 1.2 --scale 1 --nav2 masks --out views.csv
 
     Args:
         at: waypoints: a file, or x,y,z, any number of them.
         grid: instead, waypoints this many metres apart in all free space.
+        camera_z: leave out all of the grid but this z of the camera, in a world in metres with z up.
         directions: number of directions scored at each waypoint.
         lattice: fibonacci (even), or yaw-pitch (ActLoc's 6 x 18).
     """
@@ -221,18 +232,33 @@ class Select(SelectionRequest, SelectorOptions):
         check_format(self.out, self.format, max(self.n, self.looks or 1))
         if self.looks is not None and self.accuracy is not None:
             raise ConfigError("looks are for the accuracy of the weights: leave --accuracy out", value=self.accuracy)
-        if bool(self.at) == (self.grid is not None):
-            raise ConfigError("waypoints are given by either --at or --grid")
+        of_grid = self.nav2 or self.camera_z
+        reject(
+            (bool(self.at) == (self.grid is not None), "waypoints are given by either --at or --grid", None),
+            (bool(self.at and of_grid), "--nav2 and --camera-z need --grid", str(of_grid)),
+        )
 
     def run(self) -> Views:
         """Select the views, write them to `out` and print a summary."""
+        from wheretolook.planning.nav2 import check_mask, write_mask
+
+        if self.rig is not None:
+            if len(self.at) != 1 or self != replace(self, **vars(SelectionRequest())):
+                fix = "Give --at FILE, and leave --grid, numbers and limits of views out."
+                raise ConfigError("a rig is scored at its own poses", value=self.at, fix=fix)
+            return select_options(Score, self, poses=Path(self.at[0])).run()
         start = time.monotonic()
         waypoints = self._waypoints()
         selector = self.open_map(directions=self.directions, lattice=self.lattice)
+        if self.nav2:
+            check_mask(selector.scorer, self.camera_z)
         if waypoints is None:
             assert self.grid is not None
-            waypoints = selector.grid(self.grid)
+            waypoints = selector.grid(self.grid, self.camera_z)
         views = selector.select(waypoints, self, progress=True)
+        if self.nav2 and self.grid:
+            best = views[views.rank == 1]
+            write_mask(self.nav2, views.frame.world_from_map.apply(best.positions), best.score, self.grid)
         finish(self, selector, views, len(waypoints), "waypoints")
         print(f"views: {len(views)} in {time.monotonic() - start:.1f} s: {self.out}")
         return views
@@ -288,7 +314,10 @@ class Score(SelectorOptions):
         if self.frame is None and read_as != table.format:
             text = f"read as {read_as}, with a camera that looks ahead; if these are a camera's, give --frame camera"
             warnings.warn(f"{self.poses}: {text}", MapWarning, stacklevel=2)
-        views = selector.report(poses.cam_from_world, poses.waypoint_id, self.skip)
+        if self.rig is not None:
+            views = selector.report_rig(self.rig, poses.cam_from_world, poses.waypoint_id)
+        else:
+            views = selector.report(poses.cam_from_world, poses.waypoint_id, self.skip)
         views = replace(views, read_as=(read_as,) * len(views))
         finish(self, selector, views, len(poses), "poses")
         print(f"scores: {self.out}")

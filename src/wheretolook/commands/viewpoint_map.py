@@ -7,7 +7,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
 from wheretolook.commands.map import SceneOrMapOptions, imports_map
-from wheretolook.commands.options import Log, Progress, ignore_progress, load_dataset, naming_file, open_scene
+from wheretolook.commands.options import (
+    Log,
+    MaskOptions,
+    Progress,
+    ignore_progress,
+    load_dataset,
+    naming_file,
+    open_scene,
+)
 from wheretolook.dataset.dataset_lock import reads_dataset
 from wheretolook.planning.config import MappedLattice
 from wheretolook.scorers.weights import resolve_weights
@@ -18,7 +26,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
-class BuildViewpointMap(MappedLattice, SceneOrMapOptions):
+class BuildViewpointMap(MappedLattice, MaskOptions, SceneOrMapOptions):
     """Score every direction at every free voxel of a scene, for planners to query. Needs no labels.
 
     Reads a scene's map and its mesh, as `scenes` and `map` leave them, or a COLMAP model (--map); a scene of photographs has no mesh, and is free
@@ -32,6 +40,7 @@ class BuildViewpointMap(MappedLattice, SceneOrMapOptions):
     Examples:
       wheretolook viewpoint-map --config configs/demo.yaml --scene apartment-000 --out apartment.map
       wheretolook viewpoint-map --map sparse/0 --mesh scan.glb --out house.map
+      wheretolook viewpoint-map --map sparse/0 --mesh scan.glb --scale 1 --grid 40 40 6 --nav2 masks --camera-z 1.2
 
     Args:
         scene: name of the scene; empty for all scenes of the dataset.
@@ -67,14 +76,16 @@ class BuildViewpointMap(MappedLattice, SceneOrMapOptions):
         Raises:
             ConfigError: no such scene or method, or the method needs weights. WeightsError: the weights cannot be used.
             SceneError: there is no mesh, or no voxel is free. MapFormatError: the map's folder holds something else.
+            MapError: a mask for Nav2 is wanted of a map of unknown unit.
         """
+        from wheretolook.planning.nav2 import check_mask, places_at_height, write_mask
         from wheretolook.planning.scene_map import scene_scorer, scene_viewpoint_map
 
         dataset = load_dataset(self, "map")
         name = self.scene or self.imported_name
         scenes = (dataset.scene(name),) if name else dataset.scenes
-        if self.out is not None and len(scenes) != 1:
-            raise ConfigError("--out is the folder of one scene", value=str(self.out), fix="Give --scene.")
+        if (self.out or self.nav2) and len(scenes) != 1:
+            raise ConfigError("--out and --nav2 are of one scene", value=len(scenes), fix="Give --scene.")
         weights = self.weights
         if not self.method and weights is None:
             weights = resolve_weights(dataset=dataset, log=log)
@@ -85,9 +96,13 @@ class BuildViewpointMap(MappedLattice, SceneOrMapOptions):
             scene = open_scene(self, files)
             with naming_file(scene.folder.source):
                 scorer = scene_scorer(scene, self.method, weights, self.anywhere, self.accuracy)
+                if self.nav2:
+                    check_mask(scorer, self.camera_z)
                 viewpoint_map = scene_viewpoint_map(scene, self, scorer)
             folder = self.out or files.folder / "viewpoint-map"
             viewpoint_map.save(folder)
+            if self.nav2 and self.camera_z is not None:
+                write_mask(self.nav2, *places_at_height(viewpoint_map, self.camera_z))
             built[scene.name] = viewpoint_map
             n_rows, n_directions = viewpoint_map.scores.shape
             scored = f"{n_directions} directions at {n_rows} free voxels of {len(viewpoint_map.grid)}"

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
@@ -15,6 +16,7 @@ from wheretolook.evaluation.statistics import ClusterBootstrap
 from wheretolook.extend.config import TargetOptions
 from wheretolook.extend.places import pitches_within
 from wheretolook.geometry.views import Views
+from wheretolook.space.free_space import FreeSpace
 
 CAUSES = {"n_too_far": "too far", "n_too_oblique": "too oblique", "n_repeated": "repeated"}
 
@@ -26,10 +28,12 @@ class Audit:
     Attributes:
         views: the target views; `waypoint` is the row of the place.
         apart_m: how far neighbouring places are apart.
+        space: free space; places with a wall between them are no neighbours. None if it is unknown.
     """
 
     views: Views
     apart_m: float
+    space: FreeSpace | None = None
 
     @property
     def share(self) -> float:
@@ -64,9 +68,13 @@ class Audit:
             usual = strong.median() if len(strong) else table["n_visible"].max()
             # neighbours in the plane; without a floor, the heights of places of a storey differ as those of the cameras
             reach_m = (1.6 * self.apart_m, 1.6 * self.apart_m, 1.5)
-            tree = cKDTree(views.frame.world_from_map.apply(positions[weak]) / reach_m)
-            near = tree.sparse_distance_matrix(tree, 1.0)
-            region = connected_components(near, directed=False)[1]
+            centers = views.frame.world_from_map.apply(positions[weak])
+            a, b = cKDTree(centers / reach_m).query_pairs(1.0, output_type="ndarray").T
+            if self.space is not None:
+                free = self.space.segments_are_free(centers[a], centers[b])
+                a, b = a[free], b[free]
+            joined = csr_array((np.ones(len(a)), (a, b)), shape=(len(weak), len(weak)))
+            region = connected_components(joined, directed=False)[1]
             lost = np.bincount(region, (1 - table["share"].to_numpy()[weak]) * n_views[weak])
             for number, label in enumerate(np.argsort(-lost, kind="stable").tolist(), 1):
                 members = rows[weak[region == label]]

@@ -27,7 +27,7 @@ class Patches:
     points: Float  # (P, 3) m in the world
     axes: Float  # (P, 3) unit direction from the view
     distance_m: Float  # (P,) from the view
-    landmark: NDArray[np.int64]  # (P,) row in the map; -1 for surface of a mesh
+    landmark: NDArray[np.int64]  # (P,) row in the map; -1 for other surface
 
     def shares(self, chosen: NDArray[np.bool_]) -> Float:
         """Return the share of the cells of each view's image whose patch is among those chosen (P,), (V,)."""
@@ -50,47 +50,44 @@ class Surface:
     def patches(self, cam_from_world: Float, across: int, down: int) -> Patches:
         """Return the surface in the cells, so many across and down the image, of views (V, 3, 4) of the map's camera.
 
-        It is where a ray through the middle of a cell meets the mesh; else the landmark of the longest track in the cell.
+        It is where a ray through the middle of a cell meets the mesh. Else it is the landmark of the longest track in the
+        cell, or, where there is none, assumed at the median distance of landmarks: what no image has shown yet.
         """
         camera = self.localization_map.camera
         centers = camera_centers(cam_from_world)
+        x, y = np.meshgrid((np.arange(across) + 0.5) / across, (np.arange(down) + 0.5) / down)
+        rays = camera.unproject(np.column_stack([x.ravel() * camera.width, y.ravel() * camera.height]))
+        cells = np.flatnonzero(np.isfinite(rays).all(axis=1))
+        axes = (rays[cells] @ cam_from_world[:, :, :3]).reshape(-1, 3)
+        view = np.repeat(np.arange(len(centers)), len(cells))
+        landmark = np.full(len(view), -1)
         if self.raycaster is None:
-            view, landmark = self._landmark_of_cells(cam_from_world, across, down)
-            points = self.localization_map.landmarks.points[landmark]
+            landmarks = self.localization_map.landmarks
+            landmark = self._landmark_of_cells(cam_from_world, across, down)[:, cells].ravel()
+            points = centers[view] + axes * np.median(landmarks.mapping_distance_m)
+            points[landmark >= 0] = landmarks.points[landmark[landmark >= 0]]
         else:
-            x, y = np.meshgrid((np.arange(across) + 0.5) / across, (np.arange(down) + 0.5) / down)
-            rays = camera.unproject(np.column_stack([x.ravel() * camera.width, y.ravel() * camera.height]))
-            rays = rays[np.isfinite(rays).all(axis=1)]
-            axes = (rays @ cam_from_world[:, :, :3]).reshape(-1, 3)
-            view = np.repeat(np.arange(len(centers)), len(rays))
             distance = self.raycaster.cast(centers[view], axes).distance_m
             hit = np.isfinite(distance)
-            view = view[hit]
+            view, landmark = view[hit], landmark[hit]
             points = centers[view] + axes[hit] * distance[hit, None]
-            landmark = np.full(len(view), -1)
         lines = points - centers[view]
         return Patches(len(centers), across * down, view, points, unit(lines), np.linalg.norm(lines, axis=1), landmark)
 
-    def _landmark_of_cells(
-        self, cam_from_world: Float, across: int, down: int
-    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return views and landmarks (P,) of the cells of images in which there are any."""
+    def _landmark_of_cells(self, cam_from_world: Float, across: int, down: int) -> NDArray[np.int64]:
+        """Return the landmark (V, cells) in each cell of images; -1 for none."""
         camera = self.localization_map.camera
         landmarks = self.localization_map.landmarks
-        views: list[NDArray[np.int64]] = []
-        rows: list[NDArray[np.int32]] = []
+        found = np.full((len(cam_from_world), across * down), -1)
         sets = self.localization_map.landmarks_in_view(cam_from_world)
         for view in range(len(sets)):
             visible = sets[view]
+            visible = visible[np.argsort(landmarks.track_length[visible], kind="stable")]  # the longest is written last
             share = pixels_of(camera, transform(cam_from_world[view], landmarks.points[visible]))
             share /= (camera.width, camera.height)
             column, row = np.clip((share * (across, down)).astype(np.int64), 0, (across - 1, down - 1)).T
-            cell = row * across + column
-            order = np.lexsort((-landmarks.track_length[visible], cell))
-            first = order[np.unique(cell[order], return_index=True)[1]]
-            views.append(np.full(len(first), view))
-            rows.append(visible[first])
-        return np.concatenate(views), np.concatenate(rows).astype(np.int64)
+            found[view, row * across + column] = visible
+        return found
 
     def covering(self, patches: Patches, cam_from_world: Float, cameras: Sequence[Camera]) -> csr_array:
         """Return which images (I, 3, 4) of cameras (I,) show which patches so that a landmark there would be matched.
@@ -118,7 +115,7 @@ class Surface:
                 hit_m = self.raycaster.cast(locations[at], lines[rows]).distance_m
                 rows = rows[hit_m >= distance[rows] - 0.05]
             else:
-                rows = rows[unoccluded[at % block, patches.landmark[rows]]]
+                rows = rows[unoccluded[at % block, patches.landmark[rows]] | (patches.landmark[rows] < 0)]
             for image in images.tolist():
                 size = scale[rows] * sizes[image]
                 alike = rows[(size < 2.2) & (size > 1 / 2.2)]

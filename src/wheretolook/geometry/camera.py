@@ -18,6 +18,7 @@ from wheretolook.utils.errors import ConfigError, MapError, TableError, check_ch
 from wheretolook.utils.files import read_text, write_text
 
 MAX_SIDE_PX = 10**6  # of an image; COLMAP's limit is not much higher
+EQUIRECTANGULAR = "EQUIRECTANGULAR"  # COLMAP's model of panoramas
 MAX_PX = 1e12  # of a focal length or a principal point, so that products stay finite and huge integers are refused
 
 
@@ -275,7 +276,7 @@ def turn_camera(camera: Camera, quarters: int) -> Camera:
     """
     for _ in range(quarters % 4):
         given = camera.colmap
-        if given.model in ("EQUIRECTANGULAR", "RAD_TAN_THIN_PRISM_FISHEYE"):
+        if given.model in (EQUIRECTANGULAR, "RAD_TAN_THIN_PRISM_FISHEYE"):
             raise ConfigError("a camera of this model is not turned with its images", value=given.model)
         names = given._camera.params_info.split(", ")
         old = dict(zip(names, given.params, strict=True))

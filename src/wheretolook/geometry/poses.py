@@ -14,6 +14,16 @@ from wheretolook.utils.errors import PoseError
 
 Float = NDArray[np.floating[Any]]
 
+CUBE_FACES = np.array([
+    [[1, 0, 0], [0, 1, 0], [0, 0, 1]],  # ahead
+    [[0, 0, -1], [0, 1, 0], [1, 0, 0]],  # right
+    [[0, 0, 1], [0, 1, 0], [-1, 0, 0]],  # left
+    [[1, 0, 0], [0, 0, -1], [0, 1, 0]],  # down
+    [[1, 0, 0], [0, 0, 1], [0, -1, 0]],  # up
+    [[-1, 0, 0], [0, 1, 0], [0, 0, -1]],  # behind
+], dtype=np.float64)  # fmt: skip
+"""Rotations face_from_camera (6, 3, 3) of the faces of a cube."""
+
 
 def transform(cam_from_world: ArrayLike, points: ArrayLike) -> Float:
     """Apply poses (..., 3, 4) to points (N, 3). Returns (..., N, 3) in the target frame."""

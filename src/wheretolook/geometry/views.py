@@ -41,6 +41,7 @@ FORMATS = {
 WRITTEN = {
     "score": ".9g",
     "set_score": ".9g",
+    "any_score": ".9g",
     "expected_score": ".9g",
     "best_expected_score": ".9g",
     "expected_error_m": ".4g",
@@ -54,6 +55,7 @@ WRITTEN = {
     "in_range": "",
     "out_of_range": "",
     "camera_id": "",
+    "sensor": "",
     "gain": ".4f",
     "share": ".4f",
     "share_low": ".4f",
@@ -89,9 +91,11 @@ class Views:
     rank: Column = None  # (V,) 1 for the best view of the location, or the first to look along
     score: Column = None  # (V,) of the view on its own
     set_score: Column = None  # (V,) probability that all views of the location localize jointly
+    any_score: Column = None  # (V,) probability that at least one view of the location localizes alone
     expected_inliers: Column = None  # (V,) landmarks expected to be detected; NaN where the method does not predict it
     n_visible: Column = None  # (V,) visible landmarks
     camera_id: Column = None  # (V,) in the model, where views have several cameras
+    sensor: Column = None  # V names of the cameras of a rig
     in_range: Column = None  # (V,) whether the view is within the training distribution of the scorer
     out_of_range: Column = None  # (V,) quantities that are not, with their values and ranges
     # (V,) mean errors of a pose at the right place

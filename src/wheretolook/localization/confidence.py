@@ -68,6 +68,10 @@ RIGHT_PLACE: Accuracy = (math.inf, math.inf)
 
 RIGHT_PLACE_LIMITS: Accuracy = (0.5, 5.0)
 
+ERRORS_ON_PHOTOGRAPHS = 1.7
+"""Errors of poses on maps of photographs over those on maps of renders, for equal residuals of the inliers: landmarks of
+photographs share errors that do not average out (`wheretolook_paper.studies.fit_photographs`)."""
+
 MIN_INLIERS = 10  # with fewer, the localizer itself rejects a pose
 
 

@@ -18,7 +18,7 @@ from wheretolook.geometry.camera import Camera, ColmapCamera, PinholeCamera
 from wheretolook.geometry.pose_information import N_NUMBERS, bearing_numbers, information_matrices
 from wheretolook.geometry.poses import Float, camera_centers, compose_poses, invert_poses, pose_error, transform
 from wheretolook.geometry.similarity import local_origin, poses_from
-from wheretolook.localization.confidence import log_ratio
+from wheretolook.localization.confidence import ERRORS_ON_PHOTOGRAPHS, log_ratio
 from wheretolook.localization.config import LocalizerConfig
 from wheretolook.localization.rig import Look
 
@@ -30,11 +30,13 @@ within the limit as accurate ones, which makes poses worse."""
 class PoseEstimator:
     """Estimates the pose of an image from matches with points (N, 3) m by P3P in PoseLib's LO-RANSAC and refinement.
 
-    It computes in metres from `origin`, so that coordinates of a national grid lose no precision.
+    It computes in metres from `origin`, so that coordinates of a national grid lose no precision. On a map of photographs
+    the deviations of its poses are those of the inliers times `ERRORS_ON_PHOTOGRAPHS`.
     """
 
-    def __init__(self, points: Float, config: LocalizerConfig = LocalizerConfig()) -> None:
+    def __init__(self, points: Float, config: LocalizerConfig = LocalizerConfig(), photographs: bool = False) -> None:
         self.config = config
+        self.error_factor = ERRORS_ON_PHOTOGRAPHS if photographs else 1.0
         self.origin = local_origin(points)
         self.points = np.asarray(points, dtype=np.float64) - self.origin
         self.ransac = {
@@ -262,7 +264,8 @@ class Hypothesis:
         information = information_matrices(numbers)
         if self.n_inliers <= 3 or np.linalg.cond(information) > 1e14:
             return np.full((6, 6), np.inf)
-        return np.linalg.inv(information) * self.variance + self.of_focal
+        scale = self.variance * self.rig.estimator.error_factor**2
+        return np.linalg.inv(information) * scale + self.of_focal
 
     @property
     def variance(self) -> float:

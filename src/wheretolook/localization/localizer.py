@@ -67,7 +67,8 @@ class Localizer:
     Keypoints are matched to the landmarks' mean descriptors, SIFT with Lowe's ratio test, learned ones as mutual nearest
     neighbours; the pose is estimated by `PoseEstimator`. The extractor must be that of the map, and may be omitted if
     nothing is extracted. The device is "cpu" or a CUDA device. LightGlue (`LocalizerConfig.lightglue`) needs the folder
-    of the map, `map_dir`, and the features of its images, by default its database. Raises MapError if the landmarks have
+    of the map, `map_dir`, and the features of its images, by default its database. `photographs` is whether these are
+    photographs. Raises MapError if the landmarks have
     no descriptors, or not the extractor's.
     """
 
@@ -80,6 +81,7 @@ class Localizer:
         device: str = "cpu",
         map_dir: Path | None = None,
         features: Path | None = None,
+        photographs: bool = False,
     ) -> None:
         if landmarks.descriptors is None:
             raise MapError("landmarks without descriptors cannot be matched", fix="Build the map with its database.")
@@ -97,7 +99,7 @@ class Localizer:
         if config.lightglue:
             self._guided = LightGlueMatcher(landmarks, map_dir, config.lightglue, device, features)
         self.camera = camera
-        self.estimator = PoseEstimator(landmarks.points, config)
+        self.estimator = PoseEstimator(landmarks.points, config, photographs)
 
     @cached_property
     def extractor(self) -> KeypointExtractor:

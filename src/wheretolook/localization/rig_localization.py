@@ -63,6 +63,7 @@ class JointLocalization:
         rivals: the other hypotheses, by decreasing evidence, without rivals of their own.
         turn_error_deg: largest error of the known rotations if the images contradict them; else 0.
         expected: the landmarks of the map, if it is known what decides whether they are detected.
+        error_factor: of the estimator, in `covariance`.
     """
 
     status: str
@@ -78,6 +79,7 @@ class JointLocalization:
     rivals: tuple[JointLocalization, ...] = ()
     turn_error_deg: float = 0.0
     expected: ExpectedLandmarks | None = None
+    error_factor: float = 1.0
 
     @property
     def n_inliers(self) -> int:
@@ -100,13 +102,15 @@ class JointLocalization:
     def probability(self, accuracy: Accuracy = ACCURACY) -> float:
         """Probability that the pose is within an accuracy, 0 if there is no pose."""
         n_inliers = self.n_inliers
+        # the model is fitted on maps of renders: with errors that are larger by a factor, limits are as much smaller
+        scale = 1 / self.error_factor
         return ConfidenceModel.bundled().p_within(
             n_inliers,
             self.n_matches,
             self.rival_support,
             self.unique_support,
-            self.deviation,
-            accuracy,
+            (scale * self.deviation[0], scale * self.deviation[1]),
+            (scale * accuracy[0], scale * accuracy[1]),
             self.missing if n_inliers >= MIN_INLIERS else None,
         )
 
@@ -248,6 +252,7 @@ class JointLocalizer:
                 unique_support=own,
                 covariance=pose.covariance,
                 expected=self.expected,
+                error_factor=self.estimator.error_factor,
             )
             results.append(result)
         chosen = 0 if first else most_likely(unique, support)

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from wheretolook.geometry.camera import Camera, ColmapCamera, PinholeCamera
 from wheretolook.geometry.mesh import TexturedMesh
-from wheretolook.geometry.poses import Float, check_poses
+from wheretolook.geometry.poses import CUBE_FACES, Float, check_poses
 from wheretolook.geometry.similarity import poses_from
 from wheretolook.rendering.kernels import (
     TILE,
@@ -134,17 +134,6 @@ def camera_rays(camera: PinholeCamera, cam_from_world: Float) -> tuple[Float, Fl
     return centers, rotation @ np.linalg.inv(camera.matrix)
 
 
-_FACES = np.array([
-    [[1, 0, 0], [0, 1, 0], [0, 0, 1]],  # ahead
-    [[0, 0, -1], [0, 1, 0], [1, 0, 0]],  # right
-    [[0, 0, 1], [0, 1, 0], [-1, 0, 0]],  # left
-    [[1, 0, 0], [0, 0, -1], [0, 1, 0]],  # down
-    [[1, 0, 0], [0, 0, 1], [0, -1, 0]],  # up
-    [[-1, 0, 0], [0, 1, 0], [0, 0, -1]],  # behind
-], dtype=np.float64)  # fmt: skip
-"""Rotations face_from_camera (6, 3, 3) of the faces of a cube."""
-
-
 def render_distorted(renderer: Renderer, camera: ColmapCamera, cam_from_world: Float) -> Rendering:
     """What `Renderer.render` gives for poses (B, 3, 4), by looking up each pixel's ray on a cube around the camera.
 
@@ -156,7 +145,7 @@ def render_distorted(renderer: Renderer, camera: ColmapCamera, cam_from_world: F
     rgb = np.zeros((*shape, 3), dtype=np.uint8)
     depth_m = np.zeros(shape, dtype=np.float32)
     for number in np.unique(face[face >= 0]).tolist():
-        seen = renderer.render(pinhole, _FACES[number] @ cam_from_world)
+        seen = renderer.render(pinhole, CUBE_FACES[number] @ cam_from_world)
         there = face == number
         (x, y) = columns_rows
         for view in range(len(cam_from_world)):
@@ -182,9 +171,9 @@ def _lookup(
     rays = camera.unproject(pixels)
     # beyond what a model was made for, such as 90 degrees for COLMAP's fisheyes, rays come back of other pixels
     known = np.abs(camera.project(rays) - pixels).max(-1) < 0.01
-    depths = np.nan_to_num(rays) @ _FACES[:, 2].T  # (H, W, 6): along the axis of each face
+    depths = np.nan_to_num(rays) @ CUBE_FACES[:, 2].T  # (H, W, 6): along the axis of each face
     face = depths.argmax(-1)
-    in_face = (_FACES[face] @ np.nan_to_num(rays)[..., None])[..., 0]
+    in_face = (CUBE_FACES[face] @ np.nan_to_num(rays)[..., None])[..., 0]
     in_face[~known] = (0, 0, 1)
     at = (_face_camera(camera).project(in_face) - 0.5).astype(np.float32)  # OpenCV counts from pixel centres
     along = (np.nan_to_num(rays[..., 2]) / in_face[..., 2]).astype(np.float32)

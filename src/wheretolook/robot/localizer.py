@@ -131,7 +131,8 @@ class RobotLocalizer:
         self._descriptors[:, : len(points)] = descriptors.T
         self._twins = descriptors if has_twins(self, descriptors, points) else None
         self._config = LocalizerConfig(method="hypotheses")
-        self._localizer = JointLocalizer(PoseEstimator(points, self._config), turn_noise_deg, True, expected)
+        estimator = PoseEstimator(points, self._config, about.get("error_scale") is not None)
+        self._localizer = JointLocalizer(estimator, turn_noise_deg, True, expected)
         self._points = points
         self._mapping_distance_m = np.exp(distance)
         self._mean_scores = np.load(folder / "mean_scores.npy", allow_pickle=False)

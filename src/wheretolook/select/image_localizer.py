@@ -30,7 +30,14 @@ from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.mapping.map import Map, extractor_of, find_features
 from wheretolook.mapping.map_frame import MapFrame
 from wheretolook.select.localized import Localized
-from wheretolook.select.query_images import KnownCamera, QueryImage, QueryImages, distinct_names
+from wheretolook.select.query_images import (
+    KnownCamera,
+    QueryImage,
+    QueryImages,
+    cut_panorama,
+    distinct_names,
+    is_panorama,
+)
 from wheretolook.utils.errors import ConfigError, MapError, MapWarning, PoseError, TableError, WhereToLookError
 from wheretolook.utils.files import path_ends, read_text
 
@@ -98,6 +105,7 @@ class ImageLocalizer:
     pairs: ImagePairs | None = None
     lightglue: str = ""  # as in `LocalizerConfig`
     features: Path | None = None  # of the mapping images, which LightGlue matches
+    photographs: bool = False  # whether the mapping images are photographs
 
     @classmethod
     def open(
@@ -123,7 +131,17 @@ class ImageLocalizer:
         features = database or (find_features(path) if lightglue or learned else None)
         extractor = extractor or extractor_of(path, KINDS[landmarks.features])
         of_images = None if pairs is None else ImagePairs.read(pairs, opened.images)
-        result = cls(landmarks, opened.frame, QueryImages(opened), extractor, device, of_images, lightglue, features)
+        result = cls(
+            landmarks,
+            opened.frame,
+            QueryImages(opened),
+            extractor,
+            device,
+            of_images,
+            lightglue,
+            features,
+            opened.has_photographs,
+        )
         _ = (
             result._localizer.extractor,
             result.features_from,
@@ -167,7 +185,9 @@ class ImageLocalizer:
         config = LocalizerConfig(method="hypotheses", lightglue=self.lightglue)
         camera = next(iter(self.images.cameras.values()))
         map_dir = self.images.folder
-        return Localizer(self.landmarks, camera, config, self.extractor, self.device, map_dir, self.features)
+        return Localizer(
+            self.landmarks, camera, config, self.extractor, self.device, map_dir, self.features, self.photographs
+        )
 
     @cached_property
     def _rigs(self) -> JointLocalizer:
@@ -190,7 +210,8 @@ class ImageLocalizer:
             turns: rotations `cam_from_rig` (N, 3, 3), or poses (N, 3, 4) in metres; or a file, see
                 `wheretolook.localization.rig.read_turns`.
             camera: of the images, or its camera_id in the model, or a file of the cameras of images, a line each: name,
-                MODEL, width, height, parameters; None to assume the model's, or the EXIF focal length, see `QueryImages`.
+                MODEL, width, height, parameters; "panorama" for an equirectangular image; None to assume the model's, or
+                the EXIF focal length, see `QueryImages`.
             prior: rough location x, y, z of the camera in the map, and perhaps yaw in degrees of an image: one more
                 hypothesis, which wins only if the matches support it best.
             accuracy: limits in metres and degrees that the probability refers to.
@@ -218,13 +239,21 @@ class ImageLocalizer:
         queries = [self.images.read(image, name, known) for image, name in zip(given, names, strict=True)]
         near = None if prior is None else PosePrior.of(prior, self.frame.world_from_map)
         limits = checked_accuracy(accuracy, self.landmarks.mapping_distance_m)
-        results = [self._localize(paths, queries, cam_from_rig, near, limits)]
+        exact = self._localizer.joint  # rotations
+        if len(queries) == 1 and is_panorama(queries[0].camera):
+            faces, cam_from_rig = cut_panorama(queries[0])
+            if near is not None:
+                near = replace(near, yaw_deg=None)  # faces look all around
+            of_faces = self._localize(paths * len(faces), faces, cam_from_rig, near, limits, exact)
+            return of_faces.of_panorama(queries[0])
+        rig = self._rigs if len(queries) > 1 else exact
+        results = [self._localize(paths, queries, cam_from_rig, near, limits, rig)]
         if len(queries) == 1:
             (query,) = queries
             readings = [*query.others]
             if query.quarters and not self._localizer.kind.in_bytes:  # learned features change as an image turns
                 readings.append(replace(query, is_turned=True))
-            results += [self._localize(paths, [reading], cam_from_rig, near, limits) for reading in readings]
+            results += [self._localize(paths, [reading], cam_from_rig, near, limits, rig) for reading in readings]
         return max(results, key=lambda result: (result.status in (LOCALIZED, CONTRADICTED), result.n_inliers))
 
     def localize_each(
@@ -255,9 +284,9 @@ class ImageLocalizer:
         cam_from_rig: Float,
         near: PosePrior | None,
         limits: Accuracy,
+        rig: JointLocalizer,
     ) -> Localized:
         """Localize images that were read, given their names in the pairs of images and their poses in the rig."""
-        rig = self._rigs if len(queries) > 1 else self._localizer.joint
         count = POSES_OF_A_VIEW if len(queries) > 1 else POSES_OF_AN_IMAGE
         views: list[list[Look]] = []
         of_prior: list[Look] = []

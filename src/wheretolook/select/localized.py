@@ -16,7 +16,7 @@ from wheretolook.geometry.pose_files import images_text
 from wheretolook.geometry.poses import Float, camera_centers, pan_tilt_angles, quaternion_from_rotation
 from wheretolook.localization.rig_localization import JointLocalization
 from wheretolook.mapping.map_frame import IDENTITY, MapFrame
-from wheretolook.select.query_images import QueryImage
+from wheretolook.select.query_images import QueryImage, is_panorama
 from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.files import write_json, write_text
 
@@ -44,7 +44,7 @@ class Localized:
         cameras: of the images, as keypoints were extracted; an assumed focal length is refined with the pose.
         cameras_from: which camera each is and why, see `QueryImage.camera_from`; "assumed: ..." if it is not known.
         features_from: the extractor of their keypoints, see `ImageLocalizer.features_from`; "assumed: ..." as well.
-        images: the images themselves.
+        images: the images themselves; of a panorama its cut-outs.
         joint: the result in the world: metres, z up.
     """
 
@@ -104,6 +104,17 @@ class Localized:
             **values,
         )
 
+    def of_panorama(self, panorama: QueryImage) -> Localized:
+        """Convert the result of a panorama's cut-outs, of which the first has its axes, to that of the panorama."""
+        return replace(
+            self,
+            names=(panorama.name,),
+            cam_from_world=None if self.cam_from_world is None else self.cam_from_world[:1],
+            cameras=(panorama.camera,),
+            cameras_from=(panorama.camera_from,),
+            rivals=tuple(rival.of_panorama(panorama) for rival in self.rivals),
+        )
+
     def __len__(self) -> int:
         return len(self.names)
 
@@ -124,7 +135,7 @@ class Localized:
 
     def _describe_camera(self) -> str:
         """State the focal length of an assumed camera, and what it was assumed to be."""
-        if not self.cameras_from or not self.cameras_from[0].startswith("assumed"):
+        if not self.cameras_from or not self.cameras_from[0].startswith("assumed") or is_panorama(self.cameras[0]):
             return ""
         return f"; camera {self.cameras_from[0]}, refined to {self.cameras[0].colmap.mean_focal_px:.0f} px"
 

@@ -14,7 +14,9 @@ import pycolmap
 from numpy.typing import NDArray
 
 from wheretolook.geometry.camera import (
+    EQUIRECTANGULAR,
     Camera,
+    ColmapCamera,
     PinholeCamera,
     camera_of,
     describe_camera,
@@ -22,6 +24,8 @@ from wheretolook.geometry.camera import (
     read_named_cameras,
     turn_camera,
 )
+from wheretolook.geometry.camera_files import read_camera
+from wheretolook.geometry.poses import CUBE_FACES, Float
 from wheretolook.localization.rig import FocalPrior
 from wheretolook.mapping.colmap_model import find_camera
 from wheretolook.mapping.map import Map, find_photographs, has_image, reads_upright
@@ -79,12 +83,17 @@ class QueryImages:
         self.upright = reads_upright(opened.path)
 
     def known_camera(self, camera: Camera | int | str | Path | None) -> KnownCamera | None:
-        """Return a camera, given as one, by its camera_id, as a text, or as a file of the cameras of images.
+        """Return a camera, given as one, by its camera_id, as a text, or as a file: of the cameras of images, or of one (YAML, JSON).
 
+        "panorama" is an equirectangular camera with as many pixels per degree as the centres of the map's images.
         Raises MapError if the model has no such camera, ConfigError or TableError if the text or the file has none.
         """
+        if camera == "panorama":
+            half = round(np.pi * np.median([one.colmap.mean_focal_px for one in self.cameras.values()]))
+            return ColmapCamera(EQUIRECTANGULAR, 2 * half, half, (2 * half, half))
         if isinstance(camera, Path) or (isinstance(camera, str) and Path(camera).is_file()):
-            return read_named_cameras(Path(camera))
+            of_all = Path(camera).suffix in (".yaml", ".yml", ".json")
+            return read_camera(Path(camera)) if of_all else read_named_cameras(Path(camera))
         if isinstance(camera, str):
             return parse_camera(camera)
         if camera is not None and not isinstance(camera, (int, Camera)):
@@ -116,7 +125,11 @@ class QueryImages:
             return replace(self._assumed(path, name, rgb), quarters=quarters)
         if not fitting:
             problem = f"the image of {_size(rgb)} has other proportions than the camera"
-            raise ConfigError(problem, path=path, value=describe_camera(known), fix="Correct --camera.")
+            fix = "Correct --camera."
+            if is_panorama(known):
+                problem = f"the image of {_size(rgb)} is no equirectangular panorama"
+                fix = "Give an image of 360 x 180 degrees, twice as wide as high, or localize it without --panorama."
+            raise ConfigError(problem, path=path, value=describe_camera(known), fix=fix)
         return replace(_fitted(name, rgb, known, known_from), quarters=quarters)
 
     def photograph(self, name: str) -> Path | None:
@@ -200,6 +213,34 @@ class QueryImages:
         return replace(first, others=tuple(others))
 
 
+def is_panorama(camera: Camera) -> bool:
+    """Return whether the images of a camera are equirectangular."""
+    return camera.colmap.model == EQUIRECTANGULAR
+
+
+def cut_panorama(panorama: QueryImage) -> tuple[list[QueryImage], Float]:
+    """Cut an equirectangular image into the faces of a cube; return them with their cam_from_rig (6, 3, 4).
+
+    The rig has the axes of the panorama: x right, y down, z forward to the centre of its image, as the first face.
+    Faces are pinholes of 90 degrees, with the pixels per degree of the panorama at their centres.
+    """
+    import cv2
+
+    height, width = panorama.rgb.shape[:2]
+    side = 2 * max(1, round(width / (2 * np.pi)))
+    camera = PinholeCamera(side, side, side / 2)
+    rays = camera.unproject(np.stack(np.meshgrid(*2 * [np.arange(side) + 0.5]), axis=-1))
+    images = []
+    for number, cam_from_rig in enumerate(CUBE_FACES):
+        x, y, z = np.moveaxis(rays @ cam_from_rig, -1, 0)
+        columns = (np.arctan2(x, z) / (2 * np.pi) + 0.5) * width - 0.5
+        rows = (np.arcsin(y) / np.pi + 0.5) * height - 0.5
+        pixels = np.stack([columns, rows], axis=-1).astype(np.float32)
+        rgb = cv2.remap(panorama.rgb, pixels, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
+        images.append(QueryImage(f"{panorama.name} {number}", np.asarray(rgb, np.uint8), camera))
+    return images, np.pad(CUBE_FACES, ((0, 0), (0, 0), (0, 1)))
+
+
 def distinct_names(paths: Sequence[Path]) -> list[str]:
     """Return the names of files, or where some are equal, the paths from the folder that has all."""
     names = [path.name for path in paths]
@@ -223,7 +264,8 @@ def _fitted(
     name: str, rgb: NDArray[np.uint8], camera: Camera, camera_from: str, focal: FocalPrior | None = None
 ) -> QueryImage:
     """Reduce an image to the size of its camera, at most 1,600 px; return it with the camera and prior of that size."""
-    reduced = reduce_photograph(rgb, min(1600, max(camera.width, camera.height)))
+    largest = 1600 * np.pi if is_panorama(camera) else 1600  # so that a face of 90 degrees has 1,600 px
+    reduced = reduce_photograph(rgb, min(round(largest), max(camera.width, camera.height)))
     height, width = reduced.shape[:2]
     if focal is not None:
         ratio = max(width, height) / max(rgb.shape[:2])

@@ -152,14 +152,18 @@ def parse_points(texts: Sequence[str]) -> Waypoints:
     return Waypoints.of(parts)
 
 
-def grid_waypoints(localization_map: LocalizationMap, space: Any, spacing_m: float) -> Waypoints:
-    """Return locations in the world, `spacing_m` apart in all free space; their names are voxel ids.
+def grid_waypoints(
+    localization_map: LocalizationMap, space: Any, spacing_m: float, height_m: float | None = None
+) -> Waypoints:
+    """Return locations in the world, `spacing_m` apart in all free space, or at one height; their names are voxel ids.
 
     Raises a ConfigError if the spacing is no length or makes too many, a SceneError if none is free.
     """
     if not 0 < spacing_m < np.inf:
         raise ConfigError("the spacing of a grid is a length in metres", value=spacing_m, fix="Such as 0.5.")
-    low, high = np.asarray(space.bounds, dtype=np.float64)
+    low, high = np.array(space.bounds, dtype=np.float64)
+    if height_m is not None:
+        low[2] = high[2] = height_m
     cells = np.maximum(np.ceil((high - low) / spacing_m), 1)
     if np.prod(cells) > MAX_LOCATIONS:
         fix = f"The map is {high[0] - low[0]:.3g} x {high[1] - low[1]:.3g} x {high[2] - low[2]:.3g} m; widen the grid."

@@ -295,7 +295,12 @@ def read_json_object(path: Path) -> dict[str, Any]:
 
 
 def read_yaml(path: Path) -> Any:
-    """Read a YAML file of plain values; dates are texts. Raises ValueError if it is none, or if a key is given twice."""
+    """Read a YAML file (see `read_text` and `parse_yaml`)."""
+    return parse_yaml(read_text(path, 100_000))
+
+
+def parse_yaml(text: str) -> Any:
+    """Parse YAML of plain values; dates are texts. Raises ValueError if it is none, or if a key is given twice."""
     import yaml
 
     class UniqueKeys(yaml.SafeLoader):
@@ -314,7 +319,7 @@ def read_yaml(path: Path) -> Any:
             return super().construct_mapping(node, deep)
 
     try:
-        return UniqueKeys(read_text(path, 100_000)).get_single_data()
+        return UniqueKeys(text).get_single_data()
     except (yaml.YAMLError, RecursionError, TypeError, OverflowError) as error:
         raise ValueError(" ".join(str(error).split())) from error
 

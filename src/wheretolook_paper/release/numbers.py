@@ -213,6 +213,15 @@ class Numbers:
         confident = f"{100 * row['confident']:.1f}, {100 * row['precision']:.1f}"
         return [f"{100 * row['right_1']:.1f}", *joint, *stopped, confident]
 
+    def confidence(self, label: str) -> list[str]:
+        """Return what is right and predicted of poses on maps of photographs, in the mean over maps, with and without factor."""
+        table = self.table("confidence.csv")
+        table = table[table["accuracy_m"] == float(label.split()[0]) / 100]
+        means = table.select_dtypes("number").mean()
+        columns = ("right", "predicted", "loss", "predicted_without", "loss_without")
+        sure = (f"{table[f'sure_right{kind}'].sum()} of {table[f'sure{kind}'].sum()}" for kind in ("", "_without"))
+        return [*(f"{means[name]:.3f}" for name in columns), *sure]
+
     def looks(self, label: str) -> list[str]:
         rows = [self.row("looks.csv", split="test", strategy=LOOKS[label], n_looks=n) for n in (1, 2, 3, 5)]
         return [*(f"{100 * row['good']:.1f}" for row in rows), f"{100 * rows[-1]['any_good']:.1f}"]
@@ -255,6 +264,11 @@ def tables(numbers: Numbers) -> Mapping[tuple[str, str], Cells]:
             "| | positive views | AUC: set | visible | difference | within groups: set | visible | calibration error | "
             "inliers / expected |",
         ): numbers.checked,
+        (
+            "docs/looks.md",
+            "| accuracy | right | predicted | log loss | without the factor: predicted | log loss | above 99 %, right of these "
+            "| without the factor |",
+        ): numbers.confidence,
         ("docs/looks.md", "| views | one | two | three | five | any of five alone |"): numbers.looks,
     }
 

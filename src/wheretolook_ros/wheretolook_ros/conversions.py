@@ -7,13 +7,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from io import BytesIO
+from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 import PIL.Image
+import yaml
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import Point, Pose, Quaternion, Vector3, Vector3Stamped
+from geometry_msgs.msg import Point, Pose, Quaternion, Transform, Vector3, Vector3Stamped
+from nav_msgs.msg import OccupancyGrid
 from numpy.typing import NDArray
 from PIL import UnidentifiedImageError
 from scipy.spatial.transform import Rotation
@@ -148,6 +151,25 @@ def pose_message(pose: Array) -> Pose:
     """Convert a pose (3, 4) to a message."""
     turned = _named(Quaternion, Rotation.from_matrix(pose[:, :3]).as_quat())
     return Pose(position=_named(Point, pose[:, 3]), orientation=turned)
+
+
+def transform_message(pose: Array) -> Transform:
+    """Convert a pose (3, 4) to a transform."""
+    return Transform(translation=_named(Vector3, pose[:, 3]), rotation=pose_message(pose).orientation)
+
+
+def localizability_message(folder: Path, frame: str) -> OccupancyGrid:
+    """Read a mask of `wheretolook select --nav2` as the percentage of views that localize; -1 where there is no view."""
+    about = yaml.safe_load((folder / "mask.yaml").read_text(encoding="utf-8"))
+    with PIL.Image.open(folder / about["image"]) as image:
+        pixels = np.asarray(image)[::-1]
+    grid = OccupancyGrid(header=Header(frame_id=frame))
+    grid.info.height, grid.info.width = pixels.shape
+    grid.info.resolution = about["resolution"]
+    x, y, _ = about["origin"]
+    grid.info.origin.position = Point(x=x, y=y)
+    grid.data = np.where(pixels == 255, -1, np.rint(pixels / 2.55)).astype(int).ravel().tolist()
+    return grid
 
 
 def direction_message(direction: Array, frame: str, stamp: Time) -> Vector3Stamped:

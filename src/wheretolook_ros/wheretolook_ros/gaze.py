@@ -9,14 +9,23 @@ import pathlib
 
 import numpy as np
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, Vector3Stamped
-from nav_msgs.msg import Path
+from nav_msgs.msg import OccupancyGrid, Path
 from rclpy.duration import Duration
+from rclpy.qos import DurabilityPolicy, QoSProfile
 from scipy.spatial.transform import Rotation
+from std_msgs.msg import Header
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from wheretolook.planning.view_sequence import TurnLimit, best_sequence, between, lengths_along
 from wheretolook.robot.wheretolook_robot import RobotScorer, fibonacci_sphere
-from wheretolook_ros.conversions import Array, direction_message, finite, pose_matrix, pose_message
+from wheretolook_ros.conversions import (
+    Array,
+    direction_message,
+    finite,
+    localizability_message,
+    pose_matrix,
+    pose_message,
+)
 from wheretolook_ros.node import OK, RobotNode, run
 
 REUSED_M = 0.3  # within which the best view is not searched again
@@ -34,6 +43,7 @@ class GazeNode(RobotNode):
         self._joints = self.create_publisher(JointTrajectory, "joint_trajectory", 10)
         self._gaze = self.create_publisher(Vector3Stamped, "gaze/direction", 10)
         self._views = self.create_publisher(Path, "gaze/views", 10)
+        self._goals = self.create_publisher(PoseStamped, "gaze/goal_pose", 10)
         self.listen(PoseWithCovarianceStamped, "visual_localization/pose", self._on_pose)
         self.listen(Vector3Stamped, "visual_localization/next_look", self._on_next_look)
         self.listen(Path, "plan", self._on_path)
@@ -42,6 +52,10 @@ class GazeNode(RobotNode):
         self._scorer = RobotScorer(folder)
         self._axes = fibonacci_sphere(self.settings.directions)
         self._limit = TurnLimit.of(self._axes, self.settings.max_turn_deg, pan_tilt=True)
+        if self.settings.mask:
+            latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+            grids = self.create_publisher(OccupancyGrid, "localizability", latched)
+            grids.publish(localizability_message(pathlib.Path(self.settings.mask), self.settings.map_frame))
 
     def _on_next_look(self, message: Vector3Stamped) -> None:
         """Look where the localizer asks."""
@@ -113,6 +127,10 @@ class GazeNode(RobotNode):
         axis = self.head.nearest(direction)[0]
         self._gaze.publish(direction_message(axis, self.settings.base_frame, self.get_clock().now().to_msg()))
         moved = {name: value for name, value in zip(self.joint_names, joints.tolist(), strict=True) if name}
+        if not moved:  # the robot turns; without a stamp, since its latest pose counts
+            goal = np.column_stack([Rotation.from_euler("z", joints[0]).as_matrix(), np.zeros(3)])
+            header = Header(frame_id=self.settings.base_frame)
+            self._goals.publish(PoseStamped(header=header, pose=pose_message(goal)))
         point = JointTrajectoryPoint(positions=[*moved.values()])
         point.time_from_start = Duration(seconds=self.settings.turn_duration_s).to_msg()
         self._joints.publish(JointTrajectory(joint_names=[*moved], points=[point]))

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
-from geometry_msgs.msg import PoseWithCovarianceStamped, Vector3Stamped
+from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped, Vector3Stamped
 from nav_msgs.msg import Odometry
 from rclpy.qos import QoSPresetProfiles, QoSProfile, ReliabilityPolicy
 from scipy.spatial.transform import Rotation
@@ -29,9 +29,15 @@ from wheretolook_ros.conversions import (
     pose_matrix,
     pose_message,
     seconds,
+    transform_message,
 )
 from wheretolook_ros.head import Timeline
 from wheretolook_ros.node import ERROR, OK, STEADY, WARN, RobotNode, run
+
+try:
+    from tf2_msgs.msg import TFMessage
+except ImportError:  # no wheel of ROS has it
+    TFMessage = None
 
 AnyImage: TypeAlias = Image | CompressedImage
 WAIT_S = 0.5  # for odometry and joint states that are not older than the image
@@ -52,6 +58,7 @@ class LocalizerNode(RobotNode):
         self._joints = Timeline()
         self._last_stamp = -np.inf
         self._scorer: RobotScorer | None = None
+        self._map_from_odom: TransformStamped | None = None
         if not self.open_folder(self._open):
             return
         self._poses = self.create_publisher(PoseWithCovarianceStamped, "visual_localization/pose", 10)
@@ -68,6 +75,10 @@ class LocalizerNode(RobotNode):
         self.create_service(Trigger, "visual_localization/trigger_localization", self._on_trigger)
         self.create_timer(0.01, self._poll, clock=STEADY)
         self.create_timer(1.0, self._watch, clock=STEADY)
+        if self.settings.publish_tf:
+            topic = "visual_localization/map_from_odom" if TFMessage is None else "/tf"
+            self._transforms = self.create_publisher(TFMessage or TransformStamped, topic, 10)
+            self.create_timer(0.05, self._send_transform, clock=STEADY)
 
     def _open(self, folder: Path) -> None:
         given = self.settings
@@ -150,7 +161,7 @@ class LocalizerNode(RobotNode):
             confident = best.probability >= self.settings.confidence
             if confident:
                 self._prior = None
-                self._publish(best.poses[0], base_from_camera, message)
+                self._publish(best.poses[0], base_from_camera, camera_from_odom, message)
             else:
                 problem = result.reason + self._ask(best, base_from_camera, message)
         except Exception as error:  # whatever one image holds, the next one is localized
@@ -197,9 +208,20 @@ class LocalizerNode(RobotNode):
         base[:, :3] = Rotation.from_matrix(base[:, :3]).as_matrix()  # of an interpolated one the nearest rotation
         return base_from_camera, invert_poses(compose_poses(base, base_from_camera))
 
-    def _publish(self, pose: Any, base_from_camera: Array, image: AnyImage) -> None:
-        """Publish the pose of the base in the map."""
+    def _send_transform(self) -> None:
+        """Publish the last known pose of odometry in the map with the present time."""
+        if self._map_from_odom is not None:
+            self._map_from_odom.header.stamp = self.get_clock().now().to_msg()
+            sent = self._map_from_odom if TFMessage is None else TFMessage(transforms=[self._map_from_odom])
+            self._transforms.publish(sent)
+
+    def _publish(self, pose: Any, base_from_camera: Array, camera_from_odom: Array | None, image: AnyImage) -> None:
+        """Publish the pose of the base in the map, and keep that of odometry if it is known."""
         map_from_camera = invert_poses(pose.cam_from_world)
+        if camera_from_odom is not None:
+            transform = transform_message(compose_poses(map_from_camera, camera_from_odom))
+            self._map_from_odom = TransformStamped(transform=transform, child_frame_id=self.settings.odom_frame)
+            self._map_from_odom.header.frame_id = self.settings.map_frame
         map_from_base = compose_poses(map_from_camera, invert_poses(base_from_camera))
         lever = map_from_base[:, 3] - map_from_camera[:, 3]
         message = PoseWithCovarianceStamped()

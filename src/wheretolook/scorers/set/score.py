@@ -58,14 +58,14 @@ class LandmarkScorer(Scorer):
         self.training_range = TrainingRange.of_camera(camera) if training_range is None else training_range
         self.describer = LandmarkDescriber(localization_map, attributes)
         self._of_camera = camera_quantities(localization_map.camera)
-        self._serves_camera = bool(self.training_range.contains(self._of_camera[None])[0])
-        self._watch = RangeWatch(self.training_range.bounds_landmarks or not self._serves_camera)
+        self.serves_camera = bool(self.training_range.contains(self._of_camera[None])[0])
+        self._watch = RangeWatch(self.training_range.bounds_landmarks or not self.serves_camera)
 
     def in_range(self, cam_from_world: Float) -> NDArray[np.bool_]:
         """Return which poses (B, 3, 4) have views like the training views, (B,) bool."""
         cam_from_world = check_poses(cam_from_world)
-        inside = np.full(len(cam_from_world), self._serves_camera)
-        if self._serves_camera and self.training_range.bounds_landmarks:
+        inside = np.full(len(cam_from_world), self.serves_camera)
+        if self.serves_camera and self.training_range.bounds_landmarks:
             for rows, described, n_visible in self.describer.in_blocks(cam_from_world, self.max_landmarks):
                 inside[rows] = self._in_range(described, n_visible)
         return inside
@@ -249,7 +249,7 @@ class SetScorer(LandmarkScorer):
         expected_inliers = np.zeros(n)
         errors = np.empty((n, 2))
         n_visible = np.zeros(n, dtype=np.int64)
-        in_range = np.full(n, self._serves_camera)
+        in_range = np.full(n, self.serves_camera)
         out_of_range = np.full(n, "", dtype=object)
         for rows, described, visible in self.describer.in_blocks(cam_from_world, MAX_LANDMARKS):
             views = self.network.sums_of(described, visible)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import combinations, product
+from itertools import combinations, permutations, product
 from typing import Any
 
 import numpy as np
@@ -487,6 +487,13 @@ class PoseAmbiguity:
         moved = transform(compose_poses(invert_poses(other), pose), self.points[rows])
         distance, _ = self._tree.query(moved, distance_upper_bound=0.4)
         return self.count_voxels(rows[~np.isfinite(distance)])
+
+    def unique_supports(self, rows: Sequence[NDArray[np.int64]], poses: Sequence[Float]) -> NDArray[np.int64]:
+        """Return `unique_support` (K, K) of each of K poses (3, 4) with inliers in rows (M_k,), and each other pose."""
+        unique = np.zeros((len(poses), len(poses)), dtype=np.int64)
+        for k, n in permutations(range(len(poses)), 2):
+            unique[k, n] = self.unique_support(rows[k], poses[k], poses[n])
+        return unique
 
     def count_voxels(self, rows: NDArray[np.int64]) -> int:
         """Count voxels, cubes of 25 cm, with landmarks, rows (M,): those on one object are matched or mismatched jointly."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from bisect import bisect_left
 from copy import copy, deepcopy
 from dataclasses import replace
@@ -34,6 +35,7 @@ from wheretolook.training.trained_network import (
     camera_quantities,
     view_quantities,
 )
+from wheretolook.utils.errors import MapWarning
 from wheretolook.visibility.frustum import LandmarkSets
 from wheretolook.visibility.occlusion import CachedOcclusion, StoredOcclusion
 
@@ -123,7 +125,11 @@ def error_scale(localization_map: LocalizationMap) -> float:
     """
     whole = localization_map.map.whole or localization_map.map
     if "error_scale" not in whole.computed:
-        noise_px = max(0.1, whole.landmarks.keypoint_noise_px)
+        noise_px = whole.landmarks.keypoint_noise_px
+        if noise_px is None:
+            text = "no landmark has a reprojection error: keypoints count as precise to a pixel"
+            warnings.warn(f"{whole.path or 'map'}: {text}", MapWarning, stacklevel=2)
+        noise_px = max(0.1, noise_px or 1.0)
         ratio = None if whole.images is None else log_error_ratio(whole.images, whole.cameras, noise_px)
         whole.computed["error_scale"] = noise_px * (1.0 if ratio is None else exp(0.4 * (ratio - 0.27)))
     return float(whole.computed["error_scale"])

@@ -118,11 +118,19 @@ def test_rigs_that_cannot_be_scored(look, tmp_path, content, error, message):
         look.report_rig(source, POSES)
 
 
-@pytest.mark.parametrize("options", [["--n", "2"], ["--fov", "90"], ["--accuracy", "0.25,2"], ["--pan", "-9", "9"]])
-def test_a_rig_takes_no_limits_of_views_and_no_camera(sparse, tmp_path, options, capsys):
+@pytest.mark.parametrize(
+    ("command", "options"),
+    [
+        (("select", "--at"), ["--n", "2"]),
+        (("select", "--at"), ["--fov", "90"]),
+        (("score", "--poses"), ["--accuracy", "0.25,2"]),
+        (("score", "--poses"), ["--skip"]),
+    ],
+)
+def test_a_rig_takes_no_limits_of_views_and_no_camera(sparse, tmp_path, command, options, capsys):
     rig = write_rig(tmp_path / "rig.yaml", {"a": 0})
-    given = ["select", "--map", str(sparse), "--at", "path.tum", "--rig", str(rig), "--out", str(tmp_path / "a.csv")]
-    assert main([*given, *options]) == 2
+    given = ["path.tum", "--map", str(sparse), "--rig", str(rig), "--out", str(tmp_path / "a.csv")]
+    assert main([*command, *given, *options]) == 2
     assert "rig" in capsys.readouterr().err
 
 

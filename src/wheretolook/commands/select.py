@@ -122,9 +122,8 @@ class SelectorOptions(OpenOptions):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.rig is not None and (self.accuracy is not None or self.named_camera() is not None):
-            fix = "Leave cameras and the accuracy out."
-            raise ConfigError("a rig has its own cameras, and the accuracy of the weights", value=self.rig, fix=fix)
+        alone = self.rig is None or (self.accuracy or self.named_camera()) is None
+        reject((not alone, "a rig has its own cameras: leave cameras and --accuracy out", self.rig))
         if self.floor_plan is not None:
             check_choice("format of figures", self.floor_plan.suffix[1:].lower(), KINDS)
 
@@ -243,9 +242,9 @@ class Select(SelectionRequest, MaskOptions, SelectorOptions):
         from wheretolook.planning.nav2 import check_mask, write_mask
 
         if self.rig is not None:
-            if len(self.at) != 1 or self != replace(self, **vars(SelectionRequest())):
-                fix = "Give --at FILE, and leave --grid, numbers and limits of views out."
-                raise ConfigError("a rig is scored at its own poses", value=self.at, fix=fix)
+            limited = len(self.at) != 1 or self != replace(self, **vars(SelectionRequest()))
+            problem = "a rig is scored at its own poses: give --at FILE, without --grid and limits of views"
+            reject((limited, problem, self.at))
             return select_options(Score, self, poses=Path(self.at[0])).run()
         start = time.monotonic()
         waypoints = self._waypoints()
@@ -299,6 +298,7 @@ class Score(SelectorOptions):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_format(self.out, self.format, 1)
+        reject((self.rig is not None and self.skip, "a rig is scored at all poses: leave --skip out", self.rig))
 
     def run(self) -> Views:
         """Score the poses, write them to `out` and print a summary."""

@@ -48,7 +48,8 @@ def solve(points, keypoints, device):
     shifts = turns[..., 0].contiguous()
     counts = torch.full((n,), points.shape[1], dtype=torch.int32, device=device)
     drawn = torch.arange(3, dtype=torch.int32, device=device).repeat(n, 1, 1)
-    inputs = [torch.tensor(points, device=device), torch.tensor(keypoints, device=device), wp.vec2d(FOCAL, FOCAL)]
+    rays = np.pad(keypoints, ((0, 0), (0, 0), (0, 1)), constant_values=1)
+    inputs = [torch.tensor(points, device=device), torch.tensor(rays, device=device), wp.vec3d(FOCAL, FOCAL, 0)]
     wp.launch(p3p_kernel, (n, 1), [*inputs, counts, drawn, costs, turns, shifts], device=device)
     wp.synchronize_device(device)
     return torch.cat([turns, shifts[..., None]], -1)[:, 0].cpu().numpy(), costs[:, 0].cpu().numpy()

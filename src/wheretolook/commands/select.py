@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 from wheretolook.commands.options import CameraOptions, MaskOptions, ScorerOptions, select_options
 from wheretolook.dataset.config import checked_accuracy
 from wheretolook.figures import KINDS
-from wheretolook.geometry.camera import PinholeCamera, describe_camera, parse_size
+from wheretolook.geometry.camera import Camera, PinholeCamera, describe_camera, parse_size
 from wheretolook.geometry.pose_files import poses_of_rows, read_named_rows
 from wheretolook.geometry.views import Views, check_format
 from wheretolook.mapping.colmap_model import model_suffix
@@ -22,9 +22,6 @@ from wheretolook.utils.devices import usable_device
 from wheretolook.utils.errors import ConfigError, MapWarning, check_choice, reject
 
 if TYPE_CHECKING:
-    from wheretolook.geometry.camera import Camera
-    from wheretolook.geometry.views import Views
-    from wheretolook.select.waypoints import Waypoints
     from wheretolook.select.where_to_look import WhereToLook
 
 
@@ -107,7 +104,7 @@ class SelectorOptions(OpenOptions):
 
     Args:
         out: file of the views; its ending decides the format.
-        format: csv, json, tum, colmap or benchmark.
+        format: csv, json, tum, colmap, benchmark or rosbag.
         floor_plan: also draw the views on a plan of the landmarks: a file .png, .pdf or .svg.
         rig: score all cameras of a rig: a rig_id of the model, or a file as docs/rigs.md describes.
         frame: whose orientations a trajectory or table holds: base (x forward, z up) or camera (z forward). By default
@@ -185,6 +182,7 @@ class Select(SelectionRequest, MaskOptions, SelectorOptions):
       tum          t x y z qx qy qz qw, camera-to-world
       colmap       images.txt, world-to-camera; if --out is a folder, cameras.txt and an empty points3D.txt too
       benchmark    "# id qw qx qy qz tx ty tz", world-to-camera
+      rosbag       nav_msgs/Path /views for ROS 2, in metres, z up; --out is a new folder
     Rig (--rig): all its cameras are scored at poses of the rig (--at FILE, as --poses of `wheretolook score`), which has the
     axes of its reference camera. A row for each camera, rank 1 for the best; sensor: its name; any_score: probability that at
     least one localizes alone; set_score: that all do jointly.
@@ -247,7 +245,7 @@ class Select(SelectionRequest, MaskOptions, SelectorOptions):
             reject((limited, problem, self.at))
             return select_options(Score, self, poses=Path(self.at[0])).run()
         start = time.monotonic()
-        waypoints = self._waypoints()
+        waypoints = given_waypoints(self.at, self.frame) if self.at else None
         selector = self.open_map(directions=self.directions, lattice=self.lattice)
         if self.nav2:
             check_mask(selector.scorer, self.camera_z)
@@ -261,10 +259,6 @@ class Select(SelectionRequest, MaskOptions, SelectorOptions):
         finish(self, selector, views, len(waypoints), "waypoints")
         print(f"views: {len(views)} in {time.monotonic() - start:.1f} s: {self.out}")
         return views
-
-    def _waypoints(self) -> Waypoints | None:
-        """Return the waypoints, None for a grid."""
-        return given_waypoints(self.at, self.frame) if self.at else None
 
 
 @dataclass(frozen=True, kw_only=True)

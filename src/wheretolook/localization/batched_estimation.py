@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -11,6 +12,7 @@ import torch
 import warp as wp
 from numpy.typing import NDArray
 from torch import Tensor
+from torch.nn.functional import pad
 from torch.nn.utils.rnn import pad_sequence
 
 from wheretolook.geometry.poses import Float, pose_error
@@ -96,8 +98,9 @@ class MatchBatch:
         costs = self.points.new_full((*drawn.shape[:2], 4), torch.inf)
         turns = self.points.new_full((*costs.shape, 3, 3), torch.nan)
         shifts = turns[..., 0].contiguous()
-        stream = wp.stream_from_torch() if costs.is_cuda else None
-        inputs = [self.points[:, 0], self.keypoints[:, 0], wp.vec2d(*self.focal.tolist()), counts, drawn]
+        stream = wp.stream_from_torch(costs.device) if costs.is_cuda else None
+        keypoints = pad(self.keypoints[:, 0], (0, 1), value=1.0)
+        inputs = [self.points[:, 0], keypoints, wp.vec3d(*self.focal.tolist(), 0), counts, drawn]
         wp.launch(p3p_kernel, drawn.shape[:2], [*inputs, costs, turns, shifts], device=str(costs.device), stream=stream)
         few = costs.flatten(1).topk(16, largest=False).indices[..., None, None]
         poses = torch.cat([turns, shifts[..., None]], -1).flatten(1, 2)
@@ -141,34 +144,34 @@ class BatchedEstimator:
         if count == 1:
             return [(first, first) for first in firsts]
         scale = 0.5 / self.config.max_error_px  # as by `RigMatches.refine`
-        poses = _distinct(matches, matches.refine(torch.cat(found, 1), scale)[0])
+        poses, _ = matches.refine(torch.cat(found, 1), scale)
         near = [look.candidates for look in looks if look.candidates is not None]
-        squared = self._padded([of_view.squared for of_view in near], torch.inf)
-        order = torch.argsort(squared, stable=True)
-        candidates = self._matches(looks, near).take(order, squared.isfinite().gather(-1, order))
-        rows = self._padded([of_view.landmarks for of_view in near]).gather(-1, order)
-        keypoints = self._padded([of_view.keypoints for of_view in near]).gather(-1, order)
+        candidates = self._matches(looks, near)
+        rows = self._padded([of_view.landmarks for of_view in near])
+        keypoints = self._padded([of_view.keypoints for of_view in near])
         for radius_px in (12.0, 6.0):  # as by `RigMatches.guided`
             inside = candidates.errors(poses)[0].square().sum(-1) < (radius_px / self.config.max_error_px) ** 2
             chosen = _firsts(_firsts(inside, keypoints), rows)
             order = torch.argsort((~chosen).byte(), stable=True)[..., : int(chosen.sum(-1).max())]
             matches = candidates.take(order, chosen.gather(-1, order))
             poses, _ = matches.refine(poses, scale)
-        results = _results(matches, _distinct(matches, poses), rows.expand_as(chosen).gather(-1, order))
+        results = _results(matches, poses, rows.expand_as(chosen).gather(-1, order))
         return [(first, self._best(poses)) for first, poses in zip(firsts, results, strict=True)]
 
     def _best(self, poses: Sequence[EstimatedPose]) -> EstimatedPose | None:
         """Return the most likely pose, in the world, of poses by decreasing support."""
         if not poses:
             return None
-        support = [pose.support for pose in poses if pose.support >= 0.1 * poses[0].support]
-        best = 0
-        if len(support) > 1:
-            strong = poses[: len(support)]
-            best = most_likely(
-                self.ambiguity.unique_supports([x.rows for x in strong], [x.pose for x in strong]), support
-            )
-        return poses[best]._replace(pose=poses_from(poses[best].pose, -self.origin))
+        local = np.stack([x.pose for x in poses])
+        error_m, error_deg = pose_error(local[:, None], local)
+        differs = (error_m > 0.5) | (error_deg > 10)  # as by `Hypothesis.differs_from`
+        strong: list[int] = []  # others are not chosen
+        for k, pose in enumerate(poses):
+            if pose.support >= 0.1 * poses[0].support and differs[k, strong].all():
+                strong.append(k)
+        unique = self.ambiguity.unique_supports([poses[k].rows for k in strong], local[strong])
+        best = poses[strong[most_likely(unique, [poses[k].support for k in strong])]]
+        return best._replace(pose=poses_from(best.pose, -self.origin))
 
     def _padded(self, values: Sequence[NDArray[Any]], padding: float = 0) -> Tensor:
         """Copy values (M_v, ...) of V views to the device, as (V, 1, M, ...)."""
@@ -209,9 +212,8 @@ class BatchedEstimator:
             pose, cost = some.pose_by_three(drawn, counts[views].int(), 1 / self.config.max_error_px)
             best[views] = torch.where((cost < costs[views])[..., None, None], pose, best[views])
             costs[views] = torch.minimum(cost, costs[views])
-            share = some.evaluate(best[views])[1].sum((1, 2)) / number[:, 0]
-            needed = np.log(1 - self.config.confidence) / torch.log1p(-(share**3))
-            views = views[needed > trial + trials]
+            ratio = some.evaluate(best[views])[1].sum((1, 2)) / number[:, 0]
+            views = views[torch.log1p(-(ratio**3)) * (trial + trials) > math.log(1 - self.config.confidence)]
         return best
 
 
@@ -222,19 +224,6 @@ def _firsts(kept: Tensor, group: Tensor) -> Tensor:
     place = torch.where(kept, torch.arange(number, device=kept.device), number)
     first = place.new_full((*kept.shape[:2], int(group.max()) + 1), number).scatter_reduce(-1, group, place, "amin")
     return kept & (first.gather(-1, group) == place)
-
-
-def _distinct(matches: MatchBatch, poses: Tensor) -> Tensor:
-    """Replace poses that repeat one of more support by NaN."""
-    order = matches.evaluate(poses)[0].argsort(descending=True, stable=True).cpu().numpy()
-    on_host = poses.cpu().numpy()
-    error_m, error_deg = pose_error(on_host[:, :, None], on_host[:, None])
-    same = (error_m <= 0.5) & (error_deg <= 10)  # as by `Hypothesis.differs_from`
-    kept = np.zeros(order.shape, bool)
-    views = np.arange(len(kept))
-    for row in order.T:
-        kept[views, row] = ~(same[views, row] & kept).any(1)
-    return torch.where(torch.from_numpy(kept).to(poses.device)[..., None, None], poses, torch.nan)
 
 
 def _results(matches: MatchBatch, poses: Tensor, rows: Tensor) -> list[list[EstimatedPose]]:

@@ -101,14 +101,13 @@ def poselib_camera(camera: ColmapCamera, pixels: Float) -> tuple[dict[str, Any],
 def match_under(look: Look, points: Float, cam_from_world: Float, radius_px: float) -> Look:
     """Return a view with the matches of all its keypoints that agree with a pose up to a radius in pixels.
 
-    A keypoint matches the nearest of its candidates that the pose projects within the radius; a landmark keeps its
-    nearest keypoint. `points` (M, 3) m are those of the candidates.
+    A keypoint matches the first of its candidates that the pose projects within the radius; a landmark keeps its first
+    keypoint. `points` (M, 3) m are those of the candidates.
     """
     candidates = look.candidates
     assert candidates is not None
     squared = squared_errors(look.camera, candidates.pixels, points, cam_from_world)
     order = np.flatnonzero(squared < radius_px**2)
-    order = order[np.argsort(candidates.squared[order], kind="stable")]
     for values in (candidates.keypoints, candidates.landmarks):  # each keypoint once, then each landmark once
         order = order[np.sort(np.unique(values[order], return_index=True)[1])]
     return replace(look, pixels=candidates.pixels[order], rows=candidates.landmarks[order])

@@ -54,16 +54,11 @@ def frame(x: wp.vec3d, y: wp.vec3d) -> wp.mat33d:
     return wp.matrix_from_cols(x, y, wp.cross(x, y))
 
 
-@wp.func
-def ray_of(at: wp.vec2d) -> wp.vec3d:
-    return wp.normalize(wp.vec3d(at[0], at[1], ONE))
-
-
 @wp.kernel
 def p3p_kernel(
     points: wp.array2d[wp.vec3d],
-    at: wp.array2d[wp.vec2d],
-    focal: wp.vec2d,
+    keypoints: wp.array2d[wp.vec3d],
+    focal: wp.vec3d,
     counts: wp.array[wp.int32],
     drawn: wp.array2d[wp.vec3i],
     costs: wp.array3d[wp.float64],
@@ -72,7 +67,7 @@ def p3p_kernel(
 ):
     """Compute the at most four poses that explain three matches of an image, and score each by all its matches.
 
-    `at` are the pixels on the plane at depth 1; focal lengths are in units of the error limit. The cost sums squared errors,
+    Keypoints are on the plane at depth 1; focal lengths, and 0, are in units of the error limit. The cost sums squared errors,
     each at most 1 (MSAC). The depths along the rays are zeros of a pencil of conics. One of the pencil is a pair of lines,
     and each meets the others twice (Lambda Twist, Persson and Nordberg, ECCV 2018; Ding et al., CVPR 2023).
     """
@@ -84,9 +79,9 @@ def p3p_kernel(
     x = points[view, chosen[1]] - start
     y = points[view, chosen[2]] - start
     squared = wp.vec3d(wp.length_sq(x), wp.length_sq(y), wp.length_sq(x - y))
-    ray = ray_of(at[view, chosen[0]])
-    ray_x = ray_of(at[view, chosen[1]])
-    ray_y = ray_of(at[view, chosen[2]])
+    ray = keypoints[view, chosen[0]]
+    ray_x = keypoints[view, chosen[1]]
+    ray_y = keypoints[view, chosen[2]]
     none = wp.vec3d()
     # quadratic forms of squared distances in the depths
     by_x = product_with_itself(ray, -ray_x, none)
@@ -127,11 +122,8 @@ def p3p_kernel(
             cost = ZERO
             for i in range(counts[view]):
                 in_camera = turn * points[view, i] + shift
-                error = ONE
-                if in_camera[2] > ZERO:
-                    offset = wp.vec2d(in_camera[0], in_camera[1]) / in_camera[2] - at[view, i]
-                    error = wp.min(error, wp.length_sq(wp.cw_mul(focal, offset)))
-                cost += error
+                error = wp.cw_mul(focal, in_camera / in_camera[2] - keypoints[view, i])
+                cost += wp.where(in_camera[2] > ZERO, wp.min(ONE, wp.length_sq(error)), ONE)
             costs[view, trial, n] = cost
             turns[view, trial, n] = turn
             shifts[view, trial, n] = shift

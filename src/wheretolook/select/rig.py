@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from wheretolook.geometry.camera import Camera
-from wheretolook.geometry.camera_files import described_camera
+from wheretolook.geometry.camera_files import read_camera
 from wheretolook.geometry.pose_files import poses_of_values
 from wheretolook.geometry.pose_information import bearing_numbers
 from wheretolook.geometry.poses import Float, camera_centers
@@ -44,7 +44,7 @@ def read_rig(source: str | Path, opened: Map) -> list[RigCamera]:
         return [RigCamera(str(number), opened.cameras[number], pose) for number, pose in poses.items()]
     try:
         return [
-            RigCamera(str(name), described_camera(row["camera"]), poses_of_values(row["cam_from_rig"]))
+            RigCamera(str(name), read_camera(row["camera"]), poses_of_values(row["cam_from_rig"]))
             for name, row in read_yaml(Path(source)).items()
         ]
     except (OSError, ValueError, LookupError, TypeError, AttributeError, ConfigError) as error:

@@ -20,7 +20,7 @@ from wheretolook.extend.config import TargetOptions, check_extension
 from wheretolook.extend.places import drawn_views, free_places, photograph_candidates, pitches_within, places_at_heights
 from wheretolook.extend.plan import Extension, Planner
 from wheretolook.geometry.camera import Camera, PinholeCamera, describe_camera
-from wheretolook.geometry.camera_files import described_camera
+from wheretolook.geometry.camera_files import read_camera
 from wheretolook.geometry.lattices import Lattice, direction_lattice
 from wheretolook.geometry.poses import Float, camera_centers, compose_poses, rigid_poses
 from wheretolook.geometry.views import Views
@@ -105,7 +105,7 @@ class WhereToLook:
 
         Args:
             path: folder of the model.
-            weights: file or folder of weights; None for the bundled ones.
+            weights: file or folder of weights, or their name on the Hugging Face hub; None for the bundled ones.
             method: name of a method, such as "set" or "visible"; "" for that of the weights.
             camera: the camera of the views: a camera, a text such as "PINHOLE,640,480,320,320,320,240", a file as
                 `read_camera` reads it, or the camera_id of one of the model. None for the model's own; "each" for that of the image of the same name,
@@ -477,7 +477,7 @@ class WhereToLook:
 def _described_camera(camera: Camera | str | int | None, fov_deg: float | None) -> Camera | int | None:
     """Return the camera of a text or of a field of view. Raises ConfigError if both are given, or it is invalid."""
     if fov_deg is None:
-        return described_camera(camera) if isinstance(camera, str) else camera
+        return read_camera(camera) if isinstance(camera, str) else camera
     if camera is not None:
         raise ConfigError("a camera is described in two ways", value=fov_deg, fix="Give camera or fov_deg.")
     return PinholeCamera.of_field_of_view(fov_deg, 640, 480)

@@ -163,7 +163,7 @@ def test_images_without_a_pose_have_the_status_of_single_images(landmarks):
     points = landmarks.points.copy()
     points[:40] = [0.0, 0.0, 1.0] + np.linspace(0, 1, 40)[:, None] * [1.0, 0.5, 0.2]
     line = Matches.none(40)._replace(keypoints=np.arange(40), landmarks=np.arange(40))
-    line = line._replace(near=np.arange(40)[:, None], squared=np.ones((40, 1), np.float32))
+    line = line._replace(near=np.tile(np.arange(40)[:, None], 2), squared=np.tile(np.float32([1, 4]), (40, 1)))
     pixels = rng.uniform(0, 240, (40, 2)).astype(np.float32)
     few = Matches(*(values[:3] for values in line))
     images = [
@@ -209,10 +209,10 @@ def test_a_batch_that_exceeds_the_memory_is_halved(landmarks, caplog):
     estimator = localizer._batched
     whole = estimator.localize
 
-    def localize(looks, count):
-        if len(looks) > 2:
+    def localize(views, *options):
+        if len(views) > 2:
             raise RuntimeError("CUDA out of memory. Tried to allocate 1000 MiB")
-        return whole(looks, count)
+        return whole(views, *options)
 
     estimator.localize = localize
     with caplog.at_level("WARNING"):

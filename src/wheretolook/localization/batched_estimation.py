@@ -15,11 +15,14 @@ from torch import Tensor
 from torch.nn.functional import pad
 from torch.nn.utils.rnn import pad_sequence
 
+from wheretolook.features.extractor import Keypoints
+from wheretolook.features.matches import Matches
+from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import Float, pose_error
 from wheretolook.geometry.similarity import poses_from
 from wheretolook.localization.estimation import MIN_MATCHES, RIVAL_TRIALS, PoseAmbiguity, PoseEstimator, most_likely
 from wheretolook.localization.estimation_kernel import p3p_kernel
-from wheretolook.localization.rig import Candidates, Look
+from wheretolook.localization.rig import MAX_NEAREST_RATIO
 from wheretolook.utils.warp import start_warp
 
 FAR = 1e6
@@ -109,6 +112,22 @@ class MatchBatch:
         return self.refine(torch.take_along_dim(poses, best, 1), scale)
 
 
+class DeviceAmbiguity(PoseAmbiguity):
+    """Ambiguity of a map, whose landmarks (N, 3) m are on a device."""
+
+    def __init__(self, landmarks: Tensor) -> None:
+        self.points = landmarks.cpu().numpy()
+        self.landmarks = landmarks[landmarks.isfinite().all(1)].float()
+
+    def are_near(self, points: Float, radius_m: float) -> NDArray[np.bool_]:
+        """Return which points (M, 3) m have a landmark within a radius."""
+        found = torch.from_numpy(points).to(self.landmarks)
+        exact = "donot_use_mm_for_euclid_dist"
+        rows = found.split(max(1, 2**26 // max(1, len(self.landmarks))))  # of distances, 256 MB
+        nearest = [torch.cdist(part, self.landmarks, compute_mode=exact).amin(1) for part in rows]
+        return (torch.cat(nearest) < radius_m).cpu().numpy()
+
+
 class BatchedEstimator:
     """Estimates poses of images of one pinhole camera on a device, as `JointLocalizer` does those of single images.
 
@@ -117,21 +136,28 @@ class BatchedEstimator:
     depend on the other images.
     """
 
-    def __init__(self, estimator: PoseEstimator, ambiguity: PoseAmbiguity, device: str) -> None:
+    def __init__(self, estimator: PoseEstimator, device: str) -> None:
         self.config = estimator.config
         self.origin = estimator.origin
-        self.ambiguity = ambiguity
         self.device = start_warp(device)
         self.points = torch.from_numpy(estimator.points).to(self.device)
+        self.ambiguity = DeviceAmbiguity(self.points)
 
-    def localize(self, looks: Sequence[Look], count: int) -> list[tuple[EstimatedPose | None, EstimatedPose | None]]:
-        """Estimate the first and the best of `count` hypotheses of views, whose matches are sorted by quality.
+    def localize(
+        self, views: Sequence[tuple[Keypoints, Matches]], camera: PinholeCamera, count: int
+    ) -> list[tuple[EstimatedPose | None, EstimatedPose | None]]:
+        """Estimate the first and the best of `count` hypotheses of views, from their matches sorted by quality.
 
         Each is found among the matches that the others do not explain. Several are matched again under their guidance.
         """
-        rows = self._padded([look.rows for look in looks])
-        matches = self._matches(looks, looks)
-        left = self._padded([np.ones(len(look.rows), bool) for look in looks])
+        focal = torch.tensor((camera.fx, camera.fy), dtype=torch.float64, device=self.device)
+        at = [(of_view.pixels - camera.principal_point) / (camera.fx, camera.fy) for of_view, _ in views]
+        keypoints = self._padded([np.nan_to_num(of_view, nan=FAR) for of_view in at])
+        found_at = self._padded([found.keypoints for _, found in views])
+        left = self._padded([np.ones(len(found.landmarks), bool) for _, found in views])
+        rows = self._padded([found.landmarks for _, found in views])
+        focal /= self.config.max_error_px
+        matches = MatchBatch(self.points[rows], torch.take_along_dim(keypoints, found_at[..., None], 2), focal)
         found = []
         for n in range(count):
             pose = self._sample(matches, left, RIVAL_TRIALS if n else self.config.max_trials)
@@ -145,17 +171,21 @@ class BatchedEstimator:
             return [(first, first) for first in firsts]
         scale = 0.5 / self.config.max_error_px  # as by `RigMatches.refine`
         poses, _ = matches.refine(torch.cat(found, 1), scale)
-        near = [look.candidates for look in looks if look.candidates is not None]
-        candidates = self._matches(looks, near)
-        rows = self._padded([of_view.landmarks for of_view in near])
-        keypoints = self._padded([of_view.keypoints for of_view in near])
+        squared = self._padded([found.squared for _, found in views], torch.nan)
+        number = squared.shape[-1]
+        allowed = (squared <= MAX_NEAREST_RATIO**2 * squared[..., :1]).flatten(2)
+        order = torch.where(allowed, squared.flatten(2), torch.inf).argsort(stable=True)
+        order = order[..., : int(allowed.sum(-1).max())]
+        near = self._padded([found.near for _, found in views]).flatten(2).gather(-1, order)
+        seen = torch.take_along_dim(keypoints, order[..., None] // number, 2)
+        candidates = MatchBatch(self.points[near], torch.where(allowed.gather(-1, order)[..., None], seen, FAR), focal)
         for radius_px in (12.0, 6.0):  # as by `RigMatches.guided`
             inside = candidates.errors(poses)[0].square().sum(-1) < (radius_px / self.config.max_error_px) ** 2
-            chosen = _firsts(_firsts(inside, keypoints), rows)
-            order = torch.argsort((~chosen).byte(), stable=True)[..., : int(chosen.sum(-1).max())]
-            matches = candidates.take(order, chosen.gather(-1, order))
+            chosen = _firsts(_firsts(inside, order // number), near)
+            guided = torch.argsort((~chosen).byte(), stable=True)[..., : int(chosen.sum(-1).max())]
+            matches = candidates.take(guided, chosen.gather(-1, guided))
             poses, _ = matches.refine(poses, scale)
-        results = _results(matches, poses, rows.expand_as(chosen).gather(-1, order))
+        results = _results(matches, poses, near.expand_as(chosen).gather(-1, guided))
         return [(first, self._best(poses)) for first, poses in zip(firsts, results, strict=True)]
 
     def _best(self, poses: Sequence[EstimatedPose]) -> EstimatedPose | None:
@@ -176,14 +206,6 @@ class BatchedEstimator:
     def _padded(self, values: Sequence[NDArray[Any]], padding: float = 0) -> Tensor:
         """Copy values (M_v, ...) of V views to the device, as (V, 1, M, ...)."""
         return pad_sequence([torch.from_numpy(x) for x in values], True, padding)[:, None].to(self.device)
-
-    def _matches(self, looks: Sequence[Look], matched: Sequence[Look | Candidates]) -> MatchBatch:
-        camera = looks[0].camera
-        rows = [x.rows if isinstance(x, Look) else x.landmarks for x in matched]
-        rays = [(x.pixels - camera.principal_point) / (camera.fx, camera.fy) for x in matched]
-        keypoints = self._padded([np.nan_to_num(x, nan=FAR) for x in rays], FAR)
-        focal = torch.tensor((camera.fx, camera.fy), dtype=torch.float64, device=self.device)
-        return MatchBatch(self.points[self._padded(rows)], keypoints, focal / self.config.max_error_px)
 
     def _sample(self, matches: MatchBatch, left: Tensor, max_trials: int) -> Tensor:
         """Estimate a pose (V, 1, 3, 4) of each view by RANSAC among the matches that are left (V, 1, M); NaN for none."""

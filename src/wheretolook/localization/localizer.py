@@ -247,7 +247,7 @@ class Localizer:
 
     @cached_property
     def _batched(self) -> BatchedEstimator:
-        return BatchedEstimator(self.estimator, self.joint.ambiguity, self._device)
+        return BatchedEstimator(self.estimator, self._device)
 
     def estimate_batch(
         self, keypoints: Sequence[Keypoints], matches: Sequence[Matches], camera: Camera | None = None
@@ -258,15 +258,17 @@ class Localizer:
         if not (self.in_batches and isinstance(camera, PinholeCamera)):
             return [self.estimate(*view, camera) for view in views]
         several = self.config.method == "hypotheses"
-        enough = [view for view in views if len(view[1].landmarks) >= self.config.min_matches]
-        looks = [Look.of(found.pixels, pairs.by_quality(), camera) for found, pairs in enough]
+        least = self.config.min_matches
+        enough = [(found, pairs.by_quality()) for found, pairs in views if len(pairs.landmarks) >= least]
         count = POSES_OF_AN_IMAGE if several else 1
-        estimated = iter(run_halving(lambda some: self._batched.localize(some, count), looks) if looks else ())
+        estimated = iter(
+            run_halving(lambda some: self._batched.localize(some, camera, count), enough) if enough else ()
+        )
         results = []
         for found, pairs in views:
             rows = pairs.landmarks
             pixels = found.pixels[pairs.keypoints]
-            if len(rows) < self.config.min_matches:
+            if len(rows) < least:
                 results.append(Localization(TOO_FEW_MATCHES, None, rows[:0], rows, pixels))
             else:
                 first, best = (None if pose is None else pose[:2] for pose in next(estimated))

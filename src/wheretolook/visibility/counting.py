@@ -37,11 +37,12 @@ ROUNDING = 1e-5  # least relative distance of a cell's corners from a plane, sin
 def choose_size(n_points: int, n_rotations: int = 1) -> int:
     """Cells along a side of the map, an even number. About six landmarks a cell were fastest on CPU and GPU.
 
-    Fewer where the cells of very many orientations would take too much memory.
+    At least 32: of larger cells most are on the border of a view, whose landmarks are tested one by one. Fewer where the
+    cells of very many orientations would take too much memory.
     """
     # 2^28 cells of all orientations together: a byte each while they are classified
     most = min(256, 2 * int(np.sqrt((1 << 28) / max(n_rotations, 1)) / 2))
-    return int(np.clip(2 * round(np.sqrt(n_points / 6) / 2), 8, max(8, most)))
+    return int(min(max(32, 2 * round(np.sqrt(n_points / 6) / 2)), max(8, most)))
 
 
 @dataclass(frozen=True, eq=False)

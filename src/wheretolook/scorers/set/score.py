@@ -296,9 +296,9 @@ class SetScorer(LandmarkScorer):
         return log_odds
 
     def score_directions(self, locations: Float, directions: Float) -> Float:
-        """Return probabilities (L, D); where many landmarks are visible, from a smaller sample than `score`."""
+        """Return probabilities (L, D); where many landmarks are visible, from another sample than `score`."""
         if self._batched is None or not np.array_equal(self._batched.directions, directions):
             self._batched = BatchedDirections(
-                self.localization_map, self.trained, directions, MAX_LANDMARKS // 2, self.accuracy
+                self.localization_map, self.trained, directions, MAX_LANDMARKS, self.accuracy
             )
         return self._batched.score(locations)

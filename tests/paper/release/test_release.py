@@ -270,7 +270,7 @@ def test_the_shipped_weights_score_as_the_card_says(shipped, tmp_path):
                      "--evaluate.occlusions", "[]"]
     )  # fmt: skip
     experiment = with_fields(experiment, {"evaluate.resamples": 2})
-    scores = run(Evaluate, experiment, log=quiet)
+    scores = experiment.run(quiet)
     said = pd.read_csv(shipped.root / "results" / "scores.csv")
     said = said[said["occlusion"] == "mesh"].merge(scores[["method"]].drop_duplicates()).reset_index(drop=True)
     # what is compared with the reference is another here: that of the card is not among the methods

@@ -231,6 +231,21 @@ class Numbers:
         sure = (f"{table[f'sure_right{kind}'].sum()} of {table[f'sure{kind}'].sum()}" for kind in ("", "_without"))
         return [*(f"{means[name]:.3f}" for name in columns), *sure]
 
+    def panoramas(self, label: str) -> list[str]:
+        """Return shares right and counts of confident poses, right and confident, of panoramas and single cut-outs."""
+        table = self.table("panoramas.csv")
+        repeats = table["scene"].str.fullmatch(r"[a-z]+-\d+")
+        table = table[repeats if label == "two that repeat" else ~repeats]
+        right = (table["error_m"] <= 0.05) & (table["error_deg"] <= 0.4)
+        sure = table["probability"] >= 0.95
+        cells = [f"{(table['method'] == 'panorama').sum()}"]
+        for method in ("panorama", "best", "any"):
+            of_method = table["method"] == method
+            cells.append(f"{100 * right[of_method].mean():.1f}")
+            if method != "any":
+                cells.append(f"{(right & sure & of_method).sum()} of {(sure & of_method).sum()}")
+        return cells
+
     def looks(self, label: str) -> list[str]:
         rows = [self.row("looks.csv", split="test", strategy=LOOKS[label], n_looks=n) for n in (1, 2, 3, 5)]
         return [*(f"{100 * row['good']:.1f}" for row in rows), f"{100 * rows[-1]['any_good']:.1f}"]
@@ -278,6 +293,10 @@ def tables(numbers: Numbers) -> Mapping[tuple[str, str], Cells]:
             "| accuracy | right | predicted | log loss | without the factor: predicted | log loss | above 99 %, right of these "
             "| without the factor |",
         ): numbers.confidence,
+        (
+            "docs/rigs.md",
+            "| scenes | places | panorama | confident, right | most probable face | confident, right | any face |",
+        ): numbers.panoramas,
         (
             "docs/nav2.md",
             "| path, views | localized, % of the way | mean length, m | turning | pairs |",

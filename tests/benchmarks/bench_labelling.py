@@ -39,7 +39,7 @@ def main():
             "render": lambda views: renderer.render(camera, views).rgb,
             "extract": localizer.extractor.extract_batch,
             "match": lambda keypoints, localizer=localizer: [*zip(keypoints, localizer.match(keypoints), strict=True)],
-            "pose": lambda matched, localizer=localizer: [localizer.estimate(*one) for one in matched],
+            "pose": lambda matched, localizer=localizer: localizer.estimate_batch(*zip(*matched, strict=True)),
         }
         for batch in args.batches:
             for _ in range(2):

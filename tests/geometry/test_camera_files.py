@@ -75,7 +75,7 @@ def test_rays_are_those_of_the_camera_and_of_opencv(write, name, tmp_path):
     if not distortion and write is opencv:
         pytest.skip("OpenCV writes no empty matrix")
     write(tmp_path / "camera.yaml", name, distortion)
-    camera = read_camera(tmp_path / "camera.yaml")
+    camera = read_camera(str(tmp_path / "camera.yaml"))
     expected = camera_of(model, *SIZE, (*PINHOLE, *params))
     assert type(camera) is type(expected) and camera.colmap.model == expected.colmap.model
     pixels = np.random.default_rng(0).uniform((60, 60), (580, 420), (200, 2))
@@ -99,7 +99,7 @@ def test_rays_are_those_of_the_camera_and_of_opencv(write, name, tmp_path):
 )  # fmt: skip
 def test_transforms_of_nerfstudio(given, model, params, tmp_path):
     (tmp_path / "transforms.json").write_text(json.dumps({"w": 640, "h": 480, "frames": [], **given}))
-    assert read_camera(tmp_path / "transforms.json") == camera_of(model, *SIZE, params)
+    assert read_camera(str(tmp_path / "transforms.json")) == camera_of(model, *SIZE, params)
 
 
 def broken(path, **given):
@@ -130,7 +130,7 @@ def broken(path, **given):
 def test_what_is_no_camera_is_named_with_the_file(write, problem, tmp_path):
     write(tmp_path / "camera.yaml")
     with pytest.raises(ConfigError, match=problem) as raised:
-        read_camera(tmp_path / "camera.yaml")
+        read_camera(str(tmp_path / "camera.yaml"))
     assert raised.value.path == tmp_path / "camera.yaml"
 
 
@@ -142,4 +142,4 @@ def test_commands_and_python_take_the_file(tmp_path, monkeypatch):
     assert main(["select", *given, "--at", "2,2,1.5", "--out", "views.json"]) == 0
     assert json.loads((tmp_path / "views.json").read_text())["camera"]["params"] == list(PINHOLE)
     images = QueryImages(Map.open(sparse))
-    assert images.known_camera("camera_info.yaml") == read_camera(tmp_path / "camera_info.yaml")
+    assert images.known_camera("camera_info.yaml") == read_camera("camera_info.yaml")

@@ -263,15 +263,19 @@ def test_unique_support_counts_landmarks_that_the_other_location_lacks():
     here = poses_looking_along([[0.4, -0.7, 0.1]], [[1.0, 0.4, 0.0]])[0]
     there = poses_looking_along([[20.4, -0.7, 0.1]], [[1.0, 0.4, 0.0]])[0]
     ambiguity = PoseAmbiguity(points)
-    assert ambiguity.unique_support(room, here, there) == ambiguity.unique_support(copy, there, here) == 0
+    assert not ambiguity.unique_supports([room, copy], [here, there]).any()
+
+    def of_column(other):
+        return ambiguity.unique_supports([column, column], [here, other])[0, 1]
+
     # 2 m of the column, in cubes of 0.25 m whose corners lie at multiples of that: the last point is in a ninth
-    assert ambiguity.unique_support(column, here, there) == ambiguity.count_voxels(column) == 9
+    assert of_column(there) == ambiguity.count_voxels(column) == 9
     # a turn of half a circle: the room is alike, the column is where there is nothing
     turned = poses_looking_along([[-0.4, 0.7, 0.1]], [[-1.0, -0.4, 0.0]])[0]
-    assert ambiguity.unique_support(column, here, turned) == 9
+    assert of_column(turned) == 9
     # 20 cm off a thing is the same thing
     near = poses_looking_along([[0.6, -0.7, 0.1]], [[1.0, 0.4, 0.0]])[0]
-    assert ambiguity.unique_support(column, here, near) == 0
+    assert of_column(near) == 0
 
 
 @pytest.mark.parametrize("n_column", [0, 12])

@@ -423,5 +423,5 @@ def test_what_is_no_panorama_is_refused_with_the_fix(room, photos, localizer):
         localizer.localize(photos / "a.png", camera="panorama")
     with pytest.raises(ConfigError, match="either --images or --panorama"):
         Localize(map=folder)
-    with pytest.raises(ConfigError, match="Leave --turns"):
+    with pytest.raises(ConfigError, match="leave --turns"):
         Localize(map=folder, panorama=(photos / "a.png",), next=True)

@@ -25,6 +25,7 @@ from wheretolook.scorers.set.network import SetNetwork
 from wheretolook.scorers.set.score import OFFSETS, detection_offset, for_map
 from wheretolook.scorers.weights import load_scorer
 from wheretolook.training.trained_network import TrainedNetwork
+from wheretolook.utils.errors import MapWarning
 from wheretolook.visibility.occlusion import CachedOcclusion, OcclusionModel, StoredOcclusion
 
 WIDE = PinholeCamera(640, 480, 320.0)
@@ -147,6 +148,12 @@ def test_it_is_added_for_photographs_only_and_to_a_copy():
     localization_map = observed_map(0.6)
     calibrated = for_map(trained, localization_map)
     assert calibrated.error_scale == pytest.approx(max(0.1, localization_map.landmarks.keypoint_noise_px))
+    landmarks = replace(
+        localization_map.landmarks, reprojection_error_px=np.full(len(localization_map.landmarks), np.nan)
+    )
+    unknown = replace(localization_map, map=replace(localization_map.map, landmarks=landmarks))
+    with pytest.warns(MapWarning, match="reprojection error"):
+        assert for_map(trained, unknown).error_scale == pytest.approx(1.0)
     values = torch.zeros(5, len(trained.network.attributes))
     before, after = (one.network.matchability(values).sigmoid().numpy() for one in (trained, calibrated))
     assert_allclose(before, PREDICTED, rtol=1e-5)

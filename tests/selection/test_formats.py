@@ -1,6 +1,7 @@
 """Every file of views holds the poses that were selected, in the frame that it says."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
@@ -9,6 +10,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from selection.room import POINTS
+from wheretolook.geometry.similarity import Similarity
+from wheretolook.mapping.georeference import MapScale
 from wheretolook.select.waypoints import read_waypoints
 from wheretolook.utils.errors import ConfigError, StorageError
 
@@ -103,3 +106,28 @@ def test_invalid_targets_are_rejected(views, look, sparse, tmp_path):
     ):
         with pytest.raises(error):
             chosen.save(*target)
+
+
+def test_a_rosbag_holds_the_optical_frames_in_the_world(views, tmp_path):
+    pytest.importorskip("rosbags", reason="pip install '.[rosbag]'")
+    from rosbags.highlevel import AnyReader
+
+    turned = Similarity(2.0, Rotation.from_euler("z", 90, degrees=True).as_matrix(), np.array([1.0, 2.0, 3.0]))
+    moved = replace(views, frame=replace(views.frame, world_from_map=turned))
+    moved.save(tmp_path / "bag", "rosbag")
+    with AnyReader([tmp_path / "bag"]) as reader:
+        ((connection, _, data),) = reader.messages()
+        path = reader.deserialize(data, connection.msgtype)
+    assert (connection.topic, connection.msgtype) == ("/views", "nav_msgs/msg/Path")
+    assert {pose.header.frame_id for pose in (path, *path.poses)} == {"map"}
+    at = [(pose.pose.position.x, pose.pose.position.y, pose.pose.position.z) for pose in path.poses]
+    x, y, z = POINTS.T
+    np.testing.assert_allclose(at, np.column_stack([1 - 2 * y, 2 + 2 * x, 3 + 2 * z]), atol=1e-9)
+    quaternions = [[getattr(pose.pose.orientation, axis) for axis in "xyzw"] for pose in path.poses]
+    axes = Rotation.from_quat(quaternions).apply([0, 0, 1])
+    np.testing.assert_allclose(axes, views.axes @ turned.rotation.T, atol=1e-9)
+    with pytest.raises(ConfigError):  # it is a folder that exists
+        moved.save(tmp_path / "bag", "rosbag")
+    unknown = replace(views, frame=replace(views.frame, scale=MapScale("unknown")))
+    with pytest.raises(ConfigError, match="metres"):
+        unknown.save(tmp_path / "other", "rosbag")

@@ -9,6 +9,7 @@ import pytest
 
 from box_scenes import furnished_room
 from selection.room import POINTS, WEIGHTS, write_room
+from twins.directions import score_directions as score_directions_plain
 from wheretolook import LocalizationMap, WhereToLook as Exported, load_scorer, poses_looking_along
 from wheretolook.geometry.camera import ColmapCamera, PinholeCamera
 from wheretolook.geometry.lattices import direction_lattice
@@ -17,6 +18,7 @@ from wheretolook.geometry.poses import rotation_angle_deg, rotation_looking_alon
 from wheretolook.mapping.depth_images import read_depth_images
 from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.scenes.loading import save_glb
+from wheretolook.scorers.set.directions import BatchedDirections
 from wheretolook.select.waypoints import SelectionRequest, read_waypoints
 from wheretolook.select.where_to_look import WhereToLook
 from wheretolook.utils.errors import ConfigError, MapError, MapWarning, SceneError, TableError, WeightsError
@@ -62,6 +64,12 @@ def test_all_directions_at_once_score_as_one_by_one(camera, tmp_path):
     odds = [np.log(scores / (1 - scores)) for scores in (slow, fast)]
     assert np.ptp(slow) > 0.05
     np.testing.assert_allclose(odds[0], odds[1], atol=0.02)
+    # by a camera of COLMAP, views that only it can decide may be sampled otherwise
+    for limit in (512, 64) if camera is None else (512,):
+        sampled, strides = score_directions_plain(scorer, POINTS, AXES, limit)
+        batched = BatchedDirections(localization_map, scorer.trained, AXES, limit, scorer.accuracy)
+        np.testing.assert_allclose(batched.score(POINTS), sampled, atol=1e-4)
+    assert (strides.max() > 1) == (camera is None)
 
 
 def test_a_sample_of_the_landmarks_ranks_as_all(tmp_path):

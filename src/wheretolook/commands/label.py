@@ -34,6 +34,7 @@ from wheretolook.tracking import TrackingConfig, check_store, kept_if_not_logged
 from wheretolook.utils.errors import MapError, SceneError, TableError
 from wheretolook.utils.files import cache_key, read_json_object, write_json, write_text
 from wheretolook.utils.package import reports
+from wheretolook.utils.processes import cores
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -92,8 +93,14 @@ class Label(LabelOptions):
         if to_log:
             log_labels(dataset, self.tracking, seconds)
         if to_label:
-            times = ", ".join(f"{step} {spent:.1f}" for step, spent in seconds.items())
-            log(f"seconds: {times} (sums over workers for each step; then wall time)")
+            wall = seconds.pop("wall")
+            total = sum(seconds.values()) or 1.0
+            workers = self.label.workers or cores()
+            times = ", ".join(
+                f"{step} {spent:.1f} ({spent / total:.0%}, alone {spent / workers:.1f})"
+                for step, spent in seconds.items()
+            )
+            log(f"seconds over workers (share, wall time of this step alone): {times}; wall {wall:.1f}")
         return dataset
 
     def _key(self, files: SceneFolder) -> str:

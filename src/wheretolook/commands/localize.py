@@ -16,7 +16,7 @@ from wheretolook.geometry.camera import Camera
 from wheretolook.mapping.config import FrameOptions
 from wheretolook.mapping.photographs import SUFFIXES, find_photograph_files
 from wheretolook.utils.devices import usable_device
-from wheretolook.utils.errors import ConfigError, MapError, check_choice
+from wheretolook.utils.errors import ConfigError, MapError, check_choice, reject
 
 if TYPE_CHECKING:
     from wheretolook.select.image_localizer import ImageLocalizer
@@ -104,11 +104,12 @@ class Localize(CameraOptions, FrameOptions):
     def __post_init__(self) -> None:
         self.frame_options()
         self._query_camera()
-        if bool(self.images) == bool(self.panorama):
-            raise ConfigError("images are given by either --images or --panorama", value=self.images or None)
-        if self.panorama and (self.turns or self.camera or self.camera_id is not None or self.next):
-            fix = "Leave --turns, --camera, --camera-id and --next out."
-            raise ConfigError("a panorama has a known camera and all directions", value=self.panorama, fix=fix)
+        others = self.panorama and (self.turns, self.camera, self.camera_id, self.next) != (None, None, None, False)
+        problem = "a panorama shows all directions: leave --turns, --camera, --camera-id and --next out"
+        reject(
+            (bool(self.images) == bool(self.panorama), "images are given by either --images or --panorama", None),
+            (bool(others), problem, self.panorama),
+        )
         checked_accuracy(self.accuracy)
         if self.figure is not None and self.figure.suffix:
             check_choice("format of figures", self.figure.suffix[1:].lower(), KINDS)

@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeVar, get_args
 
 from wheretolook.dataset.config import RELEASE_FILE, SampleConfig
-from wheretolook.dataset.layout import Dataset
+from wheretolook.dataset.layout import Dataset, SceneFolder
 from wheretolook.dataset.scene import Scene
 from wheretolook.features.extractor import ExtractorConfig
 from wheretolook.geometry.camera import Camera, CameraConfig, describe_camera
-from wheretolook.geometry.camera_files import described_camera
+from wheretolook.geometry.camera_files import read_camera
 from wheretolook.localization.config import LabelConfig
 from wheretolook.mapping.config import MapConfig
 from wheretolook.scenes.config import ApartmentConfig, SceneKind
@@ -36,8 +36,6 @@ from wheretolook.utils.texts import LOG
 from wheretolook.visibility.config import OcclusionConfig
 
 if TYPE_CHECKING:
-    from wheretolook.dataset.layout import Dataset, SceneFolder
-    from wheretolook.dataset.scene import Scene
     from wheretolook.localization.shard import SceneJob
 
 
@@ -300,7 +298,7 @@ class CameraOptions(Command):
         """Return the camera asked for: one, a camera_id of the map, or None for the map's own."""
         if self.camera is not None and self.camera_id is not None:
             raise ConfigError("the camera is described in several ways", value=self.camera, fix="Give one of them.")
-        return self.camera_id if self.camera is None else described_camera(self.camera)
+        return self.camera_id if self.camera is None else read_camera(self.camera)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -336,7 +334,7 @@ class ScorerOptions(MeshOptions):
     Args:
         occlusion: mesh, tsdf (depth images), hidden-points (from the landmarks alone) or none; by default the first of
             these that there is data for.
-        weights: file or folder of weights; by default the bundled ones.
+        weights: file or folder of weights, or their name on the Hugging Face hub; by default the bundled ones.
         method: a name of `wheretolook evaluate --list-methods`; by default that of the weights.
         accuracy: limits of the errors in metres and degrees that scores refer to; by default those of the weights,
             0.05,0.4. In a map of unknown unit, metres are those of a median depth of 5 m.

@@ -9,10 +9,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
-from wheretolook.commands.options import CameraOptions, MaskOptions, ScorerOptions
+from wheretolook.commands.options import CameraOptions, MaskOptions, ScorerOptions, select_options
 from wheretolook.dataset.config import checked_accuracy
 from wheretolook.figures import KINDS
-from wheretolook.geometry.camera import PinholeCamera, describe_camera, parse_size
+from wheretolook.geometry.camera import Camera, PinholeCamera, describe_camera, parse_size
 from wheretolook.geometry.pose_files import poses_of_rows, read_named_rows
 from wheretolook.geometry.views import Views, check_format
 from wheretolook.mapping.colmap_model import model_suffix
@@ -22,9 +22,6 @@ from wheretolook.utils.devices import usable_device
 from wheretolook.utils.errors import ConfigError, MapWarning, check_choice, reject
 
 if TYPE_CHECKING:
-    from wheretolook.geometry.camera import Camera
-    from wheretolook.geometry.views import Views
-    from wheretolook.select.waypoints import Waypoints
     from wheretolook.select.where_to_look import WhereToLook
 
 
@@ -107,8 +104,9 @@ class SelectorOptions(OpenOptions):
 
     Args:
         out: file of the views; its ending decides the format.
-        format: csv, json, tum, colmap or benchmark.
+        format: csv, json, tum, colmap, benchmark or rosbag.
         floor_plan: also draw the views on a plan of the landmarks: a file .png, .pdf or .svg.
+        rig: score all cameras of a rig: a rig_id of the model, or a file as docs/rigs.md describes.
         frame: whose orientations a trajectory or table holds: base (x forward, z up) or camera (z forward). By default
             that of a base if all its z axes are within 45 degrees of up.
     """
@@ -117,9 +115,12 @@ class SelectorOptions(OpenOptions):
     format: str | None = None
     frame: Literal["base", "camera"] | None = None
     floor_plan: Path | None = None
+    rig: str | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        alone = self.rig is None or (self.accuracy or self.named_camera()) is None
+        reject((not alone, "a rig has its own cameras: leave cameras and --accuracy out", self.rig))
         if self.floor_plan is not None:
             check_choice("format of figures", self.floor_plan.suffix[1:].lower(), KINDS)
 
@@ -136,7 +137,7 @@ def finish(command: SelectorOptions, selector: WhereToLook, views: Views, given:
     localization_map = selector.localization_map
     if views.read_as is not None:
         print(f"{locations} read as {views.read_as[0]}")
-    camera = "that of each image" if views.camera is None else describe_camera(views.camera)
+    camera = "that of each view" if views.camera is None else describe_camera(views.camera)
     print(f"{selector.frame.describe()}; camera: {camera}")
     n_used = len({*views.waypoint.tolist()})
     skipped = f", {given - n_used} left out" if n_used < given else ""
@@ -181,6 +182,10 @@ class Select(SelectionRequest, MaskOptions, SelectorOptions):
       tum          t x y z qx qy qz qw, camera-to-world
       colmap       images.txt, world-to-camera; if --out is a folder, cameras.txt and an empty points3D.txt too
       benchmark    "# id qw qx qy qz tx ty tz", world-to-camera
+      rosbag       nav_msgs/Path /views for ROS 2, in metres, z up; --out is a new folder
+    Rig (--rig): all its cameras are scored at poses of the rig (--at FILE, as --poses of `wheretolook score`), which has the
+    axes of its reference camera. A row for each camera, rank 1 for the best; sensor: its name; any_score: probability that at
+    least one localizes alone; set_score: that all do jointly.
     A view that is not in_range is outside the training distribution of the weights: its score is less reliable.
 
     Examples:
@@ -191,6 +196,7 @@ class Select(SelectionRequest, MaskOptions, SelectorOptions):
       wheretolook select --map sparse/0 --at path.tum --max-turn 30 --looks 3 --least-score 0.7 --out views.csv
       wheretolook select --map sparse/0 --at path.tum --pan -60 60 --n 3 --apart 20 --out views.csv
       wheretolook select --map sparse/0 --at waypoints.csv --sigma 0.5 --yaw-sigma 5 --out views.csv
+      wheretolook select --map sparse/0 --at path.tum --rig rig.yaml --out cameras.csv
       wheretolook select --map sparse/0 --grid 0.5 --mesh house.glb --fov 60 --out views.csv
       wheretolook select --map sparse/0 --grid 0.25 --camera-z 1.2 --scale 1 --nav2 masks --out views.csv
 
@@ -233,8 +239,13 @@ class Select(SelectionRequest, MaskOptions, SelectorOptions):
         """Select the views, write them to `out` and print a summary."""
         from wheretolook.planning.nav2 import check_mask, write_mask
 
+        if self.rig is not None:
+            limited = len(self.at) != 1 or self != replace(self, **vars(SelectionRequest()))
+            problem = "a rig is scored at its own poses: give --at FILE, without --grid and limits of views"
+            reject((limited, problem, self.at))
+            return select_options(Score, self, poses=Path(self.at[0])).run()
         start = time.monotonic()
-        waypoints = self._waypoints()
+        waypoints = given_waypoints(self.at, self.frame) if self.at else None
         selector = self.open_map(directions=self.directions, lattice=self.lattice)
         if self.nav2:
             check_mask(selector.scorer, self.camera_z)
@@ -248,10 +259,6 @@ class Select(SelectionRequest, MaskOptions, SelectorOptions):
         finish(self, selector, views, len(waypoints), "waypoints")
         print(f"views: {len(views)} in {time.monotonic() - start:.1f} s: {self.out}")
         return views
-
-    def _waypoints(self) -> Waypoints | None:
-        """Return the waypoints, None for a grid."""
-        return given_waypoints(self.at, self.frame) if self.at else None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -285,6 +292,7 @@ class Score(SelectorOptions):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_format(self.out, self.format, 1)
+        reject((self.rig is not None and self.skip, "a rig is scored at all poses: leave --skip out", self.rig))
 
     def run(self) -> Views:
         """Score the poses, write them to `out` and print a summary."""
@@ -300,7 +308,10 @@ class Score(SelectorOptions):
         if self.frame is None and read_as != table.format:
             text = f"read as {read_as}, with a camera that looks ahead; if these are a camera's, give --frame camera"
             warnings.warn(f"{self.poses}: {text}", MapWarning, stacklevel=2)
-        views = selector.report(poses.cam_from_world, poses.waypoint_id, self.skip)
+        if self.rig is not None:
+            views = selector.report_rig(self.rig, poses.cam_from_world, poses.waypoint_id)
+        else:
+            views = selector.report(poses.cam_from_world, poses.waypoint_id, self.skip)
         views = replace(views, read_as=(read_as,) * len(views))
         finish(self, selector, views, len(poses), "poses")
         print(f"scores: {self.out}")

@@ -30,6 +30,12 @@ class Matches(NamedTuple):
         rows = np.zeros(0, dtype=np.int64)
         return cls(rows, rows, np.zeros((n_keypoints, 0), dtype=np.int64), np.zeros((n_keypoints, 0), dtype=np.float32))
 
+    def by_quality(self) -> Matches:
+        """Sort the matches by their distance over that of the last of the nearest landmarks, ascending."""
+        near = self.squared[self.keypoints]
+        order = np.argsort(near[:, 0] / np.maximum(near[:, -1], 1e-9), kind="stable")
+        return self._replace(keypoints=self.keypoints[order], landmarks=self.landmarks[order])
+
 
 class NearestLandmarks(Protocol):
     """Finds landmarks by their descriptors; see `DescriptorMatcher.nearest`."""

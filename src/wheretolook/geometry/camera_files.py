@@ -18,16 +18,15 @@ FISHEYE = ("equidistant", "fisheye", "OPENCV_FISHEYE")
 """Names of distortion models whose coefficients are those of OpenCV's perspective or fisheye camera."""
 
 
-def described_camera(text: str) -> Camera:
-    """Return the camera of a text or of the file that it names. Raises ConfigError as `parse_camera` and `read_camera`."""
-    return read_camera(Path(text)) if Path(text).is_file() else parse_camera(text)
+def read_camera(described: str) -> Camera:
+    """Return the camera of a text, see `parse_camera`, or of the file that it names.
 
-
-def read_camera(path: Path) -> Camera:
-    """Read a camera from a YAML file of ROS (also `ros2 topic echo` of a camera_info) or OpenCV, or nerfstudio's JSON.
-
-    Raises ConfigError if the file describes none, or one that is not calibrated or that COLMAP has no model for.
+    Files are YAML of ROS (also `ros2 topic echo` of a camera_info) or OpenCV, or nerfstudio's JSON. Raises ConfigError if
+    there is no camera, or one that is not calibrated or that COLMAP has no model for.
     """
+    path = Path(described)
+    if not path.is_file():
+        return parse_camera(described)
     try:
         text = read_text(path)
         # OpenCV's first line and tags are no YAML; of several messages the first is read
@@ -62,8 +61,8 @@ def _camera(given: Mapping[str, Any]) -> Camera:
         )
         if not any(matrix):
             raise ValueError("the camera is not calibrated")
-        if given.get("binning_x", 0) > 1 or given.get("roi", {}).get("width", 0) not in (0, width):
-            raise ValueError("binning and a region of interest are not supported")
+        if given.get("roi", {}).get("width", 0) not in (0, width):
+            raise ValueError("a region of interest is not supported")
         # pixel (0, 0) of ROS and OpenCV is the centre of the top-left pixel
         pinhole = matrix[0], matrix[4], matrix[2] + 0.5, matrix[5] + 0.5
     for name, n in (

@@ -28,12 +28,14 @@ from wheretolook.geometry.pose_files import (
 from wheretolook.geometry.poses import Float, camera_centers, pan_tilt_angles, quaternion_from_rotation
 from wheretolook.utils.errors import ConfigError, StorageError, check_choice
 from wheretolook.utils.files import check_output_folder, write_json, write_text
+from wheretolook.utils.package import require
 
 FORMATS = {
     "csv": "a table; position of the camera in the world, quaternion camera-to-world (wxyz, and xyzw in one cell)",
     "json": "the same, with the camera",
     "tum": "t x y z qx qy qz qw, camera-to-world: a TUM trajectory",
     "colmap": "COLMAP's images.txt, world-to-camera; a folder gets cameras.txt and points3D.txt too",
+    "rosbag": "nav_msgs/Path of optical frames in a world in metres: a folder, a rosbag for ROS 2",
     "benchmark": "# id qw qx qy qz tx ty tz, world-to-camera: poses of the Active Localization Benchmark",
 }
 """Formats, and the frames in which they have poses."""
@@ -41,6 +43,7 @@ FORMATS = {
 WRITTEN = {
     "score": ".9g",
     "set_score": ".9g",
+    "any_score": ".9g",
     "expected_score": ".9g",
     "best_expected_score": ".9g",
     "expected_error_m": ".4g",
@@ -54,6 +57,7 @@ WRITTEN = {
     "in_range": "",
     "out_of_range": "",
     "camera_id": "",
+    "sensor": "",
     "gain": ".4f",
     "share": ".4f",
     "share_low": ".4f",
@@ -89,9 +93,11 @@ class Views:
     rank: Column = None  # (V,) 1 for the best view of the location, or the first to look along
     score: Column = None  # (V,) of the view on its own
     set_score: Column = None  # (V,) probability that all views of the location localize jointly
+    any_score: Column = None  # (V,) probability that at least one view of the location localizes alone
     expected_inliers: Column = None  # (V,) landmarks expected to be detected; NaN where the method does not predict it
     n_visible: Column = None  # (V,) visible landmarks
     camera_id: Column = None  # (V,) in the model, where views have several cameras
+    sensor: Column = None  # V names of the cameras of a rig
     in_range: Column = None  # (V,) whether the view is within the training distribution of the scorer
     out_of_range: Column = None  # (V,) quantities that are not, with their values and ranges
     # (V,) mean errors of a pose at the right place
@@ -231,6 +237,8 @@ class Views:
             write_json(path, _json_content(self))
         elif chosen == "tum":
             write_text(path, _trajectory_text(self))
+        elif chosen == "rosbag":
+            _write_bag(path, self)
         elif chosen == "benchmark":
             lines = [f"{name} {pose}\n" for name, pose in zip(names, pose_texts(self.cam_from_world), strict=True)]
             write_text(path, "# id qw qx qy qz tx ty tz\n" + "".join(lines))
@@ -317,6 +325,30 @@ def _json_content(views: Views) -> dict[str, Any]:
         "camera": None if views.camera is None else views.camera.colmap.record(),
         "views": [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)],
     }
+
+
+def _write_bag(folder: Path, views: Views) -> None:
+    """Write a rosbag with a nav_msgs/Path of the optical frames. Raises ConfigError if the map's unit is unknown."""
+    require("rosbags")
+    from rosbags.rosbag2 import Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    views.frame.check_metric("a rosbag is")
+    store = get_typestore(Stores.ROS2_HUMBLE)
+
+    def make(name: str, *values: Any) -> Any:
+        return store.types[name.replace("/", "/msg/")](*values)
+
+    in_world = replace(views, cam_from_world=views.frame.world_from_map.apply_to_poses(views.cam_from_world))
+    header = make("std_msgs/Header", make("builtin_interfaces/Time", 0, 0), "map")
+    path = make("nav_msgs/Path", header, [])
+    for position, quaternion in zip(in_world.positions, in_world.quaternions_xyzw, strict=True):
+        at = make("geometry_msgs/Point", *position)
+        pose = make("geometry_msgs/Pose", at, make("geometry_msgs/Quaternion", *quaternion))
+        path.poses.append(make("geometry_msgs/PoseStamped", header, pose))
+    with Writer(folder, version=9) as writer:
+        connection = writer.add_connection("/views", path.__msgtype__, typestore=store)
+        writer.write(connection, 0, store.serialize_cdr(path, path.__msgtype__))
 
 
 def _trajectory_text(views: Views) -> str:

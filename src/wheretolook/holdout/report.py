@@ -228,7 +228,7 @@ class CheckReport:
             lines.append(f"inliers over expected: {good} of views that localize, {every} of all")
         if of_map := numbers.get("map"):
             lines.append(
-                f"keypoint noise of the map {of_map['keypoint_noise_px']:.2f} px, errors as of "
+                f"keypoint noise of the map {of_map['keypoint_noise_px'] or 1:.2f} px, errors as of "
                 f"{of_map['error_scale']:.2f} px; log-odds of detection {of_map['detection_offset'] or 0:+.2f}"
             )
         if source.fov_deg is not None:

@@ -101,14 +101,13 @@ def poselib_camera(camera: ColmapCamera, pixels: Float) -> tuple[dict[str, Any],
 def match_under(look: Look, points: Float, cam_from_world: Float, radius_px: float) -> Look:
     """Return a view with the matches of all its keypoints that agree with a pose up to a radius in pixels.
 
-    A keypoint matches the nearest of its candidates that the pose projects within the radius; a landmark keeps its
-    nearest keypoint. `points` (M, 3) m are those of the candidates.
+    A keypoint matches the first of its candidates that the pose projects within the radius; a landmark keeps its first
+    keypoint. `points` (M, 3) m are those of the candidates.
     """
     candidates = look.candidates
     assert candidates is not None
     squared = squared_errors(look.camera, candidates.pixels, points, cam_from_world)
     order = np.flatnonzero(squared < radius_px**2)
-    order = order[np.argsort(candidates.squared[order], kind="stable")]
     for values in (candidates.keypoints, candidates.landmarks):  # each keypoint once, then each landmark once
         order = order[np.sort(np.unique(values[order], return_index=True)[1])]
     return replace(look, pixels=candidates.pixels[order], rows=candidates.landmarks[order])
@@ -477,16 +476,23 @@ class PoseAmbiguity:
         self.points = points
         self._tree = cKDTree(points[np.isfinite(points).all(axis=1)])
 
-    def unique_support(self, rows: NDArray[np.int64], pose: Float, other: Float) -> int:
-        """Count voxels with landmarks, rows (M,), that agree with a pose and that the other pose cannot explain.
+    def unique_supports(self, rows: Sequence[NDArray[np.int64]], poses: Sequence[Float]) -> NDArray[np.int64]:
+        """Count voxels (K, K) with landmarks, rows (M_k,), that agree with each pose and that each other cannot explain.
 
-        Both poses (3, 4) are from the world into the same frame of camera or rig. A landmark within 0.4 m of a moved one
-        is its counterpart: different points are triangulated on two copies of an object. On validation scenes 0.25 to
-        0.6 m work equally.
+        K poses (3, 4) are from the world into the same frame of camera or rig. A landmark within 0.4 m of a moved one is
+        its counterpart: different points are triangulated on two copies of an object. On validation scenes 0.25 to 0.6 m
+        work equally.
         """
-        moved = transform(compose_poses(invert_poses(other), pose), self.points[rows])
-        distance, _ = self._tree.query(moved, distance_upper_bound=0.4)
-        return self.count_voxels(rows[~np.isfinite(distance)])
+        unique = []
+        for of_pose, pose in zip(rows, poses, strict=True):
+            moved = transform(compose_poses(invert_poses(poses), pose), self.points[of_pose])
+            near = self.are_near(moved.reshape(-1, 3), 0.4).reshape(moved.shape[:2])
+            unique.append([self.count_voxels(of_pose[~explained]) for explained in near])
+        return np.array(unique)
+
+    def are_near(self, points: Float, radius_m: float) -> NDArray[np.bool_]:
+        """Return which points (M, 3) m have a landmark within a radius."""
+        return np.isfinite(self._tree.query(points, distance_upper_bound=radius_m)[0])
 
     def count_voxels(self, rows: NDArray[np.int64]) -> int:
         """Count voxels, cubes of 25 cm, with landmarks, rows (M,): those on one object are matched or mismatched jointly."""
@@ -502,7 +508,7 @@ def _preferences(unique: NDArray[np.int64], support: ArrayLike) -> Float:
 
 
 def strongest_rival(unique: NDArray[np.int64], support: Sequence[float], k: int) -> int:
-    """Index of the pose that is the strongest evidence against pose `k`; `unique` (K, K) as by `unique_support`."""
+    """Index of the pose that is the strongest evidence against pose `k`; `unique` (K, K) as by `unique_supports`."""
     preference = _preferences(unique, support)[k]
     preference[k] = np.inf
     return int(np.argmin(preference))

@@ -23,9 +23,10 @@ from wheretolook.features.extractor import (
 )
 from wheretolook.features.matches import Matches, has_twins, match
 from wheretolook.features.matching import MAX_NEAREST, DescriptorIndex, DescriptorMatcher, SimilarityMatcher, has_index
-from wheretolook.geometry.camera import Camera
+from wheretolook.geometry.camera import Camera, PinholeCamera
 from wheretolook.geometry.poses import Float, pose_error, transform
 from wheretolook.geometry.similarity import poses_from
+from wheretolook.localization.batched_estimation import BatchedEstimator
 from wheretolook.localization.config import LocalizerConfig
 from wheretolook.localization.estimation import PoseEstimator
 from wheretolook.localization.lightglue import LightGlueMatcher
@@ -34,6 +35,7 @@ from wheretolook.localization.rig import Look
 from wheretolook.localization.rig_localization import POSES_OF_AN_IMAGE, JointLocalizer
 from wheretolook.mapping.colmap_model import ModelArrays
 from wheretolook.mapping.landmarks import MAP_ATTRIBUTES, Landmarks
+from wheretolook.utils.devices import run_halving
 from wheretolook.utils.errors import MapError
 
 Matcher = DescriptorMatcher | DescriptorIndex | SimilarityMatcher
@@ -92,6 +94,7 @@ class Localizer:
         if extractor is not None:
             self._check_extractor()
         self._device = device
+        self.in_batches = device != "cpu"
         self._descriptors = landmarks.descriptors
         indexed = self.kind.in_bytes and config.method == "hypotheses" and has_index(len(landmarks), device)
         self._matcher = DescriptorIndex(self._descriptors) if indexed else self._matcher_of(self._descriptors)
@@ -222,20 +225,56 @@ class Localizer:
             found = self.joint.single_view_poses(look, POSES_OF_AN_IMAGE)
             best = self.joint.localize([look], [found])
             inlier_rows = best.looks[0].rows[best.inliers[0]] if best.inliers else rows[:0]
-            in_map = [(poses_from(pose, -self.estimator.origin), inliers) for pose, inliers in found[:1]]
-            first = self._first(in_map[0] if in_map else None, pixels, rows)
+            in_map = [(poses_from(pose, -self.estimator.origin), rows[inliers]) for pose, inliers in found[:1]]
+            first = self._result(in_map[0] if in_map else None, pixels, rows)
             return Localization(best.status, best.rig_from_world, inlier_rows, rows, pixels, first)
-        return self._first(self.estimator.estimate(pixels, rows, camera or self.camera), pixels, rows)
+        estimated = self.estimator.estimate(pixels, rows, camera or self.camera)
+        return self._result(None if estimated is None else (estimated[0], rows[estimated[1]]), pixels, rows)
 
-    def _first(
-        self, estimated: tuple[Float, NDArray[np.bool_]] | None, pixels: NDArray[np.float32], rows: NDArray[np.int64]
+    def _result(
+        self,
+        estimated: tuple[Float, NDArray[np.int64]] | None,
+        pixels: NDArray[np.float32],
+        rows: NDArray[np.int64],
+        first: Localization | None = None,
     ) -> Localization:
-        """Return the result for a pose (3, 4), if RANSAC found one, and its inliers among matches (M,)."""
+        """Return the result for a pose (3, 4), if there is one, with its inliers among matched rows (M,)."""
         if estimated is None:
-            return Localization(NO_POSE, None, rows[:0], rows, pixels)
-        pose, inliers = estimated
-        status = LOCALIZED if inliers.sum() >= self.config.min_inliers else NO_POSE
-        return Localization(status, pose, rows[inliers], rows, pixels)
+            return Localization(NO_POSE, None, rows[:0], rows, pixels, first)
+        pose, inlier_rows = estimated
+        status = LOCALIZED if len(inlier_rows) >= self.config.min_inliers else NO_POSE
+        return Localization(status, pose, inlier_rows, rows, pixels, first)
+
+    @cached_property
+    def _batched(self) -> BatchedEstimator:
+        return BatchedEstimator(self.estimator, self._device)
+
+    def estimate_batch(
+        self, keypoints: Sequence[Keypoints], matches: Sequence[Matches], camera: Camera | None = None
+    ) -> list[Localization]:
+        """Estimate the poses of several images of a camera: on a GPU at once, if it is a pinhole."""
+        camera = camera or self.camera
+        views = list(zip(keypoints, matches, strict=True))
+        if not (self.in_batches and isinstance(camera, PinholeCamera)):
+            return [self.estimate(*view, camera) for view in views]
+        several = self.config.method == "hypotheses"
+        least = self.config.min_matches
+        enough = [(found, pairs.by_quality()) for found, pairs in views if len(pairs.landmarks) >= least]
+        count = POSES_OF_AN_IMAGE if several else 1
+        estimated = iter(
+            run_halving(lambda some: self._batched.localize(some, camera, count), enough) if enough else ()
+        )
+        results = []
+        for found, pairs in views:
+            rows = pairs.landmarks
+            pixels = found.pixels[pairs.keypoints]
+            if len(rows) < least:
+                results.append(Localization(TOO_FEW_MATCHES, None, rows[:0], rows, pixels))
+            else:
+                first, best = (None if pose is None else pose[:2] for pose in next(estimated))
+                of_first = self._result(first, pixels, rows)
+                results.append(self._result(best, pixels, rows, of_first) if several else of_first)
+        return results
 
 
 def localization_errors(results: Sequence[Localization], true_poses: Float) -> tuple[Float, Float]:

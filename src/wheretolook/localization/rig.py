@@ -42,26 +42,25 @@ MAX_NEAREST_RATIO = 1.15
 
 @dataclass(frozen=True, eq=False)
 class Candidates:
-    """Landmarks whose descriptors are about as near to a keypoint's as the nearest of the map.
+    """Landmarks whose descriptors are about as near to a keypoint's as the nearest of the map, sorted by their distances.
 
     Attributes:
         keypoints: (M,) rows of an image's keypoints.
         pixels: (M, 2) their pixels.
         landmarks: (M,) rows of their candidates.
-        squared: (M,) squared distances of the descriptors.
     """
 
     keypoints: NDArray[np.int64]
     pixels: Float
     landmarks: NDArray[np.int64]
-    squared: NDArray[np.float32]
 
     @classmethod
     def of(cls, pixels: Float, matches: Matches) -> Candidates:
         """Select from the nearest landmarks of keypoints at pixels (K, 2)."""
-        near = matches.squared <= MAX_NEAREST_RATIO**2 * matches.squared[:, :1]
-        keypoints = np.repeat(np.arange(len(near)), near.sum(1))
-        return cls(keypoints, pixels[keypoints], matches.near[near], matches.squared[near])
+        keypoints, columns = np.nonzero(matches.squared <= MAX_NEAREST_RATIO**2 * matches.squared[:, :1])
+        order = np.argsort(matches.squared[keypoints, columns], kind="stable")
+        keypoints = keypoints[order]
+        return cls(keypoints, pixels[keypoints], matches.near[keypoints, columns[order]])
 
 
 @dataclass(frozen=True)

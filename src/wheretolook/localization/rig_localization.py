@@ -232,7 +232,8 @@ class JointLocalizer:
 
     def _ranked(self, hypotheses: Sequence[Hypothesis], n_matches: int, first: bool) -> JointLocalization:
         """Compare hypotheses; return the best with the others as its rivals."""
-        unique = self._unique_support(hypotheses)
+        poses = [pose.rig_from_world for pose in hypotheses]
+        unique = self.ambiguity.unique_supports([pose.inlier_rows for pose in hypotheses], poses)
         support = [pose.support for pose in hypotheses]
         results = []
         for k, pose in enumerate(hypotheses):
@@ -258,15 +259,3 @@ class JointLocalizer:
         chosen = 0 if first else most_likely(unique, support)
         best = results.pop(chosen)
         return replace(best, rivals=tuple(results))
-
-    def _unique_support(self, hypotheses: Sequence[Hypothesis]) -> NDArray[np.int64]:
-        """Numbers (K, K) of locations that each of K poses explains and each other does not."""
-        unique = np.zeros((len(hypotheses), len(hypotheses)), dtype=np.int64)
-        for k, pose in enumerate(hypotheses):
-            for n, other in enumerate(hypotheses):
-                if n != k:
-                    only_here = self.ambiguity.unique_support(
-                        pose.inlier_rows, pose.rig_from_world, other.rig_from_world
-                    )
-                    unique[k, n] = only_here
-        return unique

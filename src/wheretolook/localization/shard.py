@@ -204,9 +204,8 @@ def label_rows(
     drawn = Appearance.of_views(true_poses, job.appearance, seed) if job.appearance else []
     is_changed = _is_changed(table, seed) if changed else np.zeros(len(table), dtype=bool)
     batches = []
-    # Viewpoints of 640 x 480 per batch, unless the extractor wants more: many workers share a GPU, and each holds its
-    # batches' images and scale spaces there.
-    batch_size = max(8, localizer.extractor.batch_of(640, 480))
+    # viewpoints of 640 x 480, unless the extractor takes more; poses on a GPU take as long for 8 as for 64
+    batch_size = max(64 if localizer.in_batches else 8, localizer.extractor.batch_of(640, 480))
     for camera, rows in _by_camera(table, job):
         size = min(batch_size, max(1, batch_size * 640 * 480 // (camera.width * camera.height)))
         shown_in = [(renderer, rows[~is_changed[rows]])]
@@ -278,8 +277,7 @@ class _BatchLabeller:
 
     def estimate(self, matched: tuple[_Batch, list[Keypoints], list[Matches]]) -> list[Localization]:
         batch, keypoints, matches = matched
-        views = zip(keypoints, matches, strict=True)
-        return [self.localizer.estimate(found, pairs, batch.camera) for found, pairs in views]
+        return self.localizer.estimate_batch(keypoints, matches, batch.camera)
 
 
 def _images(batch: _Batch, views: NDArray[np.int64]) -> NDArray[np.uint8]:

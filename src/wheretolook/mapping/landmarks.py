@@ -65,8 +65,8 @@ class Landmarks:
         return len(self.ids)
 
     @property
-    def keypoint_noise_px(self) -> float:
-        """Standard deviation of a coordinate of the mapping images' keypoints, in pixels; 1 if it is unknown.
+    def keypoint_noise_px(self) -> float | None:
+        """Standard deviation of a coordinate of the mapping images' keypoints, in pixels; None if it is unknown.
 
         The median over landmarks of at least three observations of their mean reprojection error over that of normal
         noise, sqrt(pi / 2). A track of n keypoints has 2 n coordinates, and determines 3.
@@ -74,7 +74,7 @@ class Landmarks:
         known = (self.track_length >= 3) & (self.reprojection_error_px > 0)  # 0 and NaN are unknown
         n = self.track_length[known].astype(np.float64)
         noise = self.reprojection_error_px[known] * np.sqrt(4 * n / (np.pi * (2 * n - 3)))
-        return float(np.median(noise)) if len(n) else 1.0
+        return float(np.median(noise)) if len(n) else None
 
     def attributes(self) -> NDArray[np.float32]:
         """`MAP_ATTRIBUTES` of each landmark, (N, len(MAP_ATTRIBUTES)) float32."""

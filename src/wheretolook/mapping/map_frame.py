@@ -25,7 +25,7 @@ from wheretolook.mapping.georeference import (
     scale_from_depths,
     scale_from_positions,
 )
-from wheretolook.utils.errors import ConfigError, MapError, MapWarning, SceneError
+from wheretolook.utils.errors import ConfigError, MapError, MapWarning, SceneError, reject
 from wheretolook.utils.files import read_json_object
 
 if TYPE_CHECKING:
@@ -209,6 +209,11 @@ class MapFrame:
     def is_turned(self) -> bool:
         """Whether the axes of the map are not those of the world."""
         return not np.allclose(self.world_from_map.rotation, np.eye(3), atol=1e-3)
+
+    def check_metric(self, what: str) -> None:
+        """Raise ConfigError, which names what is in metres, if the map's unit is unknown."""
+        problem = f"{what} in metres, and the unit of the map is unknown: give --scale, --distance or --positions"
+        reject((not self.scale.is_metric, problem, None))
 
     @property
     def unit(self) -> str:

@@ -16,13 +16,10 @@ from wheretolook.utils.files import check_output_folder, write_bytes, write_text
 
 def check_mask(scorer: Scorer, camera_z: float | None) -> None:
     """Raise ConfigError if the height of the camera or the unit of the map is unknown, or scores are no probabilities."""
-    is_metric = scorer.localization_map.frame.scale.is_metric
-    unknown = "Nav2 needs metres, and the unit of this map is unknown: give --scale, --distance or --positions"
-    other = "a mask for Nav2 is of probabilities: use the method set, or another learned one"
+    scorer.localization_map.frame.check_metric("a mask for Nav2 is")
     reject(
         (camera_z is None, "a mask for Nav2 needs the height of the camera: give --camera-z, its z in metres", None),
-        (not is_metric, unknown, None),
-        (not is_probability(scorer.name), other, scorer.name),
+        (not is_probability(scorer.name), "a mask for Nav2 is of probabilities, as of the method set", scorer.name),
     )
 
 

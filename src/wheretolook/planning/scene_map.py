@@ -18,7 +18,7 @@ from wheretolook.dataset.layout import Dataset
 from wheretolook.dataset.scene import Scene
 from wheretolook.dataset.viewpoint_table import pose_columns
 from wheretolook.geometry.camera import PinholeCamera
-from wheretolook.geometry.lattices import ViewLattice, VoxelGrid
+from wheretolook.geometry.lattices import ViewLattice, VoxelGrid, spread_rows
 from wheretolook.geometry.poses import Float, poses_looking_along, rotation_looking_along, transform
 from wheretolook.geometry.similarity import Similarity
 from wheretolook.geometry.views import Views
@@ -108,22 +108,18 @@ def _score_and_count(
     ranked = np.empty((len(locations), len(directions)), dtype=np.uint16)
     scores = np.empty(ranked.shape, dtype=np.float32)
     # enough views at once to fill a GPU, few enough for the progress bar to move
-    block = max(1, 16_384 // len(directions))
+    block = max(1, (1 << 14 if localization_map.device == "cpu" else 1 << 17) // len(directions))
     text = progress and f"{progress}: score"
     with tqdm(total=len(locations), desc=text, unit="voxel", disable=progress is None) as bar:
         for begin in range(0, len(locations), block):
             rows = slice(begin, begin + block)
-            values = _score_exactly(scorer, locations[rows], directions)
+            values = scorer.score_directions(locations[rows], directions)
             ranked[rows] = np.argsort(-values, axis=1, kind="stable")
             scores[rows] = values
             bar.update(len(values))
+    checked = spread_rows(len(locations), 1000)
+    scorer.score(poses_looking_along(locations[checked], directions[ranked[checked, 0]]))  # warns of views out of range
     return ranked, scores, counted.counts.astype(np.uint32)
-
-
-def _score_exactly(scorer: Scorer, locations: Float, directions: Float) -> Float:
-    """Scores (L, D) of directions (D, 3) at locations (L, 3) m; `Scorer.score_directions` may approximate them."""
-    poses = poses_looking_along(np.repeat(locations, len(directions), axis=0), np.tile(directions, (len(locations), 1)))
-    return scorer.score(poses).reshape(len(locations), len(directions))
 
 
 def _unit(directions: ArrayLike) -> Float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -30,8 +31,8 @@ def resolve_weights(
 ) -> Path | None:
     """Return the weights file that a method or a family scores with; None for a method without weights.
 
-    An empty `method` stands for any that scores views by itself. A `path` is a file, or a folder of which the best file
-    is taken. Without one the candidates are the files in the `dataset`'s folder, then in the release next to it, then
+    An empty `method` stands for any that scores views by itself. A `path` is a file, or a folder or name on the hub of
+    which the best file is taken (`find_weights`). Without one the candidates are the files in the `dataset`'s folder, then in the release next to it, then
     the bundled ones. In a folder, files trained on the map's `features` come first.
 
     With a `dataset`, `features` default to those of its maps, a given file of another method is passed over, files that
@@ -49,7 +50,7 @@ def resolve_weights(
         return None
     if path is None and dataset is not None:
         return _best_for_dataset(dataset, kinds, log)
-    place = shipped(WEIGHTS) if path is None else or_shipped(path)
+    place = shipped(WEIGHTS) if path is None else find_weights(path)
     if not place.is_dir():
         kind = method_of_weights(place)
         if kind in kinds:
@@ -72,7 +73,7 @@ def weights_by_method(path: str | Path, features: str = "") -> dict[str, Path]:
     In a folder, files trained on the map's `features` come first; unreadable ones are left out. Raises as
     `resolve_weights`.
     """
-    path = or_shipped(path)
+    path = find_weights(path)
     best = resolve_weights(path=path, features=features)
     assert best is not None
     files = {method_of_weights(best): best}
@@ -83,11 +84,32 @@ def weights_by_method(path: str | Path, features: str = "") -> dict[str, Path]:
     return files
 
 
+def find_weights(path: str | Path) -> Path:
+    """Return the path of local or bundled weights, or else of those of a name, "owner/name", on the Hugging Face hub.
+
+    Weights in the hub's cache are taken from there; others are downloaded. Raises WeightsError if that fails.
+    """
+    place = or_shipped(path)
+    if place.exists() or place.suffix == ".safetensors" or len(place.parts) != 2:
+        return place
+    home = Path(os.environ.get("HF_HOME", "~/.cache/huggingface")).expanduser()
+    cached = home / "hub" / "--".join(("models", *place.parts))
+    try:
+        if (cached / "refs/main").is_file():
+            return cached / "snapshots" / (cached / "refs/main").read_text()
+        from huggingface_hub import snapshot_download
+
+        return Path(snapshot_download(place.as_posix()))
+    except (ImportError, OSError, ValueError) as error:
+        fix = "Correct the path, or for weights on the hub: pip install 'wheretolook[hub]'."
+        raise WeightsError(f"there are no such weights, also not on the hub: {error}", path=place, fix=fix) from error
+
+
 def load_scorer(localization_map: LocalizationMap, weights: str | Path | None = None, anywhere: bool = False) -> Scorer:
     """Return the learned scorer of a map: `load_scorer(localization_map).score(cam_from_world)`.
 
     `weights` are a file that the train command wrote, whose header names the method, or a folder of such files, of
-    which `resolve_weights` takes the best; None for the bundled ones. A path such as `data/release/weights` names
+    which `resolve_weights` takes the best, or a name on the Hugging Face hub, "owner/name"; None for the bundled ones. A path such as `data/release/weights` names
     bundled files from any working directory. With `anywhere`, weights adapted to one scene score in another.
 
     Raises:

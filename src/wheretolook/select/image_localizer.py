@@ -240,10 +240,7 @@ class ImageLocalizer:
         near = None if prior is None else PosePrior.of(prior, self.frame.world_from_map)
         limits = checked_accuracy(accuracy, self.landmarks.mapping_distance_m)
         exact = self._localizer.joint  # rotations
-        if any(is_panorama(query.camera) for query in queries):
-            if len(queries) > 1:
-                problem = "a panorama is not localized together with other images"
-                raise ConfigError(problem, value=names, fix="Leave the turns out.")
+        if len(queries) == 1 and is_panorama(queries[0].camera):
             faces, cam_from_rig = cut_panorama(queries[0])
             if near is not None:
                 near = replace(near, yaw_deg=None)  # faces look all around

@@ -93,7 +93,7 @@ class QueryImages:
             return ColmapCamera(EQUIRECTANGULAR, 2 * half, half, (2 * half, half))
         if isinstance(camera, Path) or (isinstance(camera, str) and Path(camera).is_file()):
             of_all = Path(camera).suffix in (".yaml", ".yml", ".json")
-            return read_camera(Path(camera)) if of_all else read_named_cameras(Path(camera))
+            return read_camera(str(camera)) if of_all else read_named_cameras(Path(camera))
         if isinstance(camera, str):
             return parse_camera(camera)
         if camera is not None and not isinstance(camera, (int, Camera)):

@@ -19,10 +19,10 @@ from wheretolook.extend.audit import Audit
 from wheretolook.extend.config import TargetOptions, check_extension
 from wheretolook.extend.places import drawn_views, free_places, photograph_candidates, pitches_within, places_at_heights
 from wheretolook.extend.plan import Extension, Planner
-from wheretolook.geometry.camera import Camera, PinholeCamera
-from wheretolook.geometry.camera_files import described_camera
+from wheretolook.geometry.camera import Camera, PinholeCamera, describe_camera
+from wheretolook.geometry.camera_files import read_camera
 from wheretolook.geometry.lattices import Lattice, direction_lattice
-from wheretolook.geometry.poses import Float, camera_centers, rigid_poses
+from wheretolook.geometry.poses import Float, camera_centers, compose_poses, rigid_poses
 from wheretolook.geometry.views import Views
 from wheretolook.inputs.landmark_features import ReasonCounter
 from wheretolook.inputs.localization_map import LocalizationMap
@@ -32,12 +32,13 @@ from wheretolook.mapping.map_frame import MapFrame
 from wheretolook.scorers.base import Scorer
 from wheretolook.scorers.registry import is_probability, make_scorer
 from wheretolook.scorers.weights import resolve_weights
+from wheretolook.select.rig import read_rig, rig_scores
 from wheretolook.select.selection import reported, select_views, usable_waypoints, with_reasons
 from wheretolook.select.waypoints import SelectionRequest, Waypoints, grid_waypoints
 from wheretolook.space.mapped_space import MappedSpace
 from wheretolook.training.weights import method_of_weights
 from wheretolook.utils.devices import usable_device
-from wheretolook.utils.errors import ConfigError, MapError, MapWarning, PlanningError, check_names
+from wheretolook.utils.errors import CameraError, ConfigError, MapError, MapWarning, PlanningError, check_names
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -104,7 +105,7 @@ class WhereToLook:
 
         Args:
             path: folder of the model.
-            weights: file or folder of weights; None for the bundled ones.
+            weights: file or folder of weights, or their name on the Hugging Face hub; None for the bundled ones.
             method: name of a method, such as "set" or "visible"; "" for that of the weights.
             camera: the camera of the views: a camera, a text such as "PINHOLE,640,480,320,320,320,240", a file as
                 `read_camera` reads it, or the camera_id of one of the model. None for the model's own; "each" for that of the image of the same name,
@@ -284,6 +285,34 @@ class WhereToLook:
         together = replace(Views.concatenate(parts), camera=None).in_frame(self.frame)
         return together[np.argsort(together.waypoint, kind="stable")]
 
+    def report_rig(self, rig: str | Path, rig_from_world: ArrayLike, names: Sequence[str] = ()) -> Views:
+        """Score all cameras of a rig, a rig_id or file as of `read_rig`, at poses of the rig (W, 3, 4), world-to-rig.
+
+        The best camera of each pose has rank 1. `sensor` names the camera, `any_score` is the probability that at least
+        one localizes alone, `set_score` that all do jointly. Raises errors as `report` and `read_rig`, and CameraError if
+        the scorer does not serve a camera.
+        """
+        poses = rigid_poses(rig_from_world)
+        parts = []
+        scorers = []
+        for name, camera, cam_from_rig in read_rig(rig, self.localization_map.map):
+            look = self._of_camera(camera)
+            if not getattr(look.scorer, "serves_camera", False):
+                problem = f"the method {look.scorer.name} does not predict detections by the camera {name} of the rig"
+                fix = "Use the method set, and a field of view of its training range."
+                raise CameraError(problem, path=rig, value=describe_camera(camera), fix=fix)
+            views = look.report(compose_poses(cam_from_rig, poses), names)
+            parts.append(replace(views, sensor=(name,) * len(views)))
+            scorers.append(look.scorer)
+        views = Views.concatenate(parts)
+        scores = views.score.reshape(len(parts), -1)
+        in_world = self.frame.world_from_map.apply_to_poses(views.cam_from_world).reshape(*scores.shape, 3, 4)
+        found = [rig_scores(scorers, in_world[:, row], scores[:, row]) for row in range(len(poses))]
+        any_score, set_score = np.repeat(found, len(parts), axis=0).T
+        rank = np.tile(np.arange(1, len(parts) + 1), len(poses))
+        best_first = views[np.lexsort((-views.score, views.waypoint))]
+        return replace(best_first, camera=None, rank=rank, any_score=any_score, set_score=set_score)
+
     def _of_camera(self, camera: Camera) -> WhereToLook:
         """Return the same for another camera."""
         assert self._build is not None
@@ -448,7 +477,7 @@ class WhereToLook:
 def _described_camera(camera: Camera | str | int | None, fov_deg: float | None) -> Camera | int | None:
     """Return the camera of a text or of a field of view. Raises ConfigError if both are given, or it is invalid."""
     if fov_deg is None:
-        return described_camera(camera) if isinstance(camera, str) else camera
+        return read_camera(camera) if isinstance(camera, str) else camera
     if camera is not None:
         raise ConfigError("a camera is described in two ways", value=fov_deg, fix="Give camera or fov_deg.")
     return PinholeCamera.of_field_of_view(fov_deg, 640, 480)

@@ -56,6 +56,7 @@ EXTRAS = {
     "jinja2": "paper",
     "ray": "ray",
     "rerun": "view",
+    "rosbags": "rosbag",
 }
 """Extras by module; of several that install it, the smallest."""
 

@@ -37,11 +37,12 @@ ROUNDING = 1e-5  # least relative distance of a cell's corners from a plane, sin
 def choose_size(n_points: int, n_rotations: int = 1) -> int:
     """Cells along a side of the map, an even number. About six landmarks a cell were fastest on CPU and GPU.
 
-    Fewer where the cells of very many orientations would take too much memory.
+    At least 32: of larger cells most are on the border of a view, whose landmarks are tested one by one. Fewer where the
+    cells of very many orientations would take too much memory.
     """
     # 2^28 cells of all orientations together: a byte each while they are classified
     most = min(256, 2 * int(np.sqrt((1 << 28) / max(n_rotations, 1)) / 2))
-    return int(np.clip(2 * round(np.sqrt(n_points / 6) / 2), 8, max(8, most)))
+    return int(min(max(32, 2 * round(np.sqrt(n_points / 6) / 2)), max(8, most)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -238,25 +239,16 @@ class FrustumCounter:
 
 
 @dataclass(frozen=True, eq=False)
-class Surroundings:
-    """The M landmarks that are unoccluded from a block of locations, sorted into cells, on the lister's device."""
-
-    sorted: Any  # `counting_kernel.SortedLandmarks`
-    rows: Any  # (M,) int32 rows of the points
-
-    @property
-    def offsets(self) -> Any:
-        """(M,) vec3 from the location to the landmark, in the world, metres."""
-        return self.sorted.offsets[: max(1, self.rows.shape[0])]
-
-
-@dataclass(frozen=True, eq=False)
 class ListedViews:
-    """The landmarks in view of V views, E in all."""
+    """Landmarks in view of V views."""
 
-    starts: NDArray[np.int64]  # (V + 1,); view v has `starts[v]` to `starts[v + 1]` of the next two
-    entries: Any  # (E,) int32 rows of `Surroundings`, on the lister's device
-    image: Any  # (E,) vec2, x / z and y / z in the camera, likewise
+    n_visible: NDArray[
+        np.float32
+    ]  # (V,) in view; estimated where only a camera of COLMAP can decide, and a part is listed
+    starts: NDArray[np.int64]  # (V,) first entry of each view in the next two
+    lengths: NDArray[np.int64]  # (V,) listed landmarks
+    entries: Any  # int32 entries of the sorted landmarks, on the lister's device
+    image: Any  # vec2, x / z and y / z in the camera, likewise
 
 
 def compile_kernels(device: str) -> None:
@@ -275,8 +267,8 @@ class FrustumLister(FrustumCounter):
     Views (V, 2) are given by rows of the locations and of the rotations.
     """
 
-    def surroundings(self, locations: ArrayLike, points: Any, unoccluded: Any | None) -> Surroundings:
-        """What is unoccluded from locations (L, 3) m.
+    def surroundings(self, locations: ArrayLike, points: Any, unoccluded: Any | None) -> Any:
+        """`counting_kernel.SortedLandmarks`: the M that are unoccluded from locations (L, 3) m.
 
         Landmarks (N,) of vec3d and mask (L, N) of bool are Warp arrays on the device; without a mask all lines of sight
         are free.
@@ -284,53 +276,57 @@ class FrustumLister(FrustumCounter):
         at = as_points(locations)
         n_cells = self.size**2 + 1
         landmarks, places = self._sorted(at, points, unoccluded)
-        rows: Any = wp.empty(int(landmarks.starts[len(at) * n_cells :].numpy()[0]), dtype=wp.int32, device=self.device)
+        number = int(landmarks.starts[len(at) * n_cells :].numpy()[0])
+        landmarks.rows = wp.empty(number, dtype=wp.int32, device=self.device)
         inputs = [places, landmarks.starts, n_cells]
-        wp.launch(counting_kernel.rows_kernel, places.shape, inputs, [rows], device=self.device)
-        return Surroundings(landmarks, rows)
+        wp.launch(counting_kernel.rows_kernel, places.shape, inputs, [landmarks.rows], device=self.device)
+        return landmarks
 
-    def lengths(self, candidates: Surroundings, views: NDArray[np.integer[Any]]) -> NDArray[np.int64]:
-        """How many landmarks views see, (V,). Those are included that only a COLMAP camera itself could decide."""
-        lengths: Any = wp.empty(len(views), dtype=wp.int64, device=self.device)
-        none = [wp.empty(0, dtype=dtype, device=self.device) for dtype in (wp.int64, wp.int32, wp.vec2)]
-        self._launch(candidates, views, False, none[0], lengths, none[1], none[2])
-        return np.asarray(lengths.numpy())
+    def list(self, candidates: Any, views: NDArray[np.integer[Any]], limit: int) -> ListedViews:
+        """What views see of `surroundings`.
 
-    def list(
-        self, candidates: Surroundings, views: NDArray[np.integer[Any]], lengths: NDArray[np.int64]
-    ) -> ListedViews:
-        """What views see, by the lengths (V,) that `lengths` gives of them."""
-        starts = np.concatenate([[0], np.cumsum(lengths)])
-        entries: Any = wp.empty(int(starts[-1]), dtype=wp.int32, device=self.device)
-        image: Any = wp.empty(int(starts[-1]), dtype=wp.vec2, device=self.device)
-        first: Any = wp.array(starts[:-1], dtype=wp.int64, device=self.device)
-        self._launch(
-            candidates, views, True, first, wp.empty(len(views), dtype=wp.int64, device=self.device), entries, image
-        )
+        Of more than `limit` landmarks every second of the map's, every fourth, and so on, are listed, so that between
+        half of `limit` and `limit` remain; never more than twice as many.
+        """
+        strides = np.ones(len(views), dtype=np.int64)
+        in_view, *_ = self._launch(candidates, views, strides, 0 * strides)
+        strides <<= np.ceil(np.log2(np.maximum(in_view, 1) / limit)).clip(0).astype(np.int64)
+        rooms = np.minimum(in_view, 2 * limit)
+        lengths, entries, image = self._launch(candidates, views, strides, rooms)
+        lengths = np.minimum(lengths, rooms)
+        starts = np.cumsum(rooms) - rooms
         camera = self.camera
         if not isinstance(camera, ColmapCamera):
-            return ListedViews(starts, entries, image)
-        on_host = entries.numpy()
+            return ListedViews(in_view.astype(np.float32), starts, lengths, entries, image)
+        used = np.repeat(starts + lengths, rooms) > np.arange(rooms.sum())
+        on_host = entries.numpy()[used]
 
         def sees(view: NDArray[np.int64], rows: NDArray[np.int32]) -> NDArray[np.bool_]:
             return camera_sees(camera, self.rotations, views[view, 1], candidates.offsets.numpy()[rows])
 
-        kept, starts = decided(on_host, starts, sees)
+        kept, ends = decided(on_host, np.concatenate([[0], np.cumsum(lengths)]), sees)
+        share = np.diff(ends) / np.maximum(lengths, 1)
         there: Any = wp.array(on_host[kept], dtype=wp.int32, device=self.device)
-        return ListedViews(starts, there, wp.array(image.numpy()[kept], dtype=wp.vec2, device=self.device))
+        seen: Any = wp.array(image.numpy()[used][kept], dtype=wp.vec2, device=self.device)
+        return ListedViews((share * in_view).astype(np.float32), ends[:-1], np.diff(ends), there, seen)
 
     def _launch(
-        self, candidates: Surroundings, views: Any, write: bool, first: Any, lengths: Any, entries: Any, image: Any
-    ) -> None:
-        asked: Any = wp.array(np.asarray(views, dtype=np.int32), dtype=wp.vec2i, device=self.device)
-        outputs = [lengths, entries, image]
+        self, candidates: Any, views: Any, strides: NDArray[np.int64], rooms: NDArray[np.int64]
+    ) -> tuple[NDArray[np.int64], Any, Any]:
+        """Return the landmarks that views see, (V,) and, in the room that each has, their entries and positions."""
+        ends = np.concatenate([[0], np.cumsum(rooms)])
+        asked: Any = wp.array(np.column_stack([views, strides]).astype(np.int32), dtype=wp.vec3i, device=self.device)
+        rotations = [asked, self._axes]
+        shared = [candidates, wp.array(ends, dtype=wp.int64, device=self.device)]
+        shapes = ((len(views), wp.int64), (int(ends[-1]), wp.int32), (int(ends[-1]), wp.vec2))
+        outputs: list[Any] = [wp.empty(size, dtype=dtype, device=self.device) for size, dtype in shapes]
         if self._field is not None:
-            inputs = [asked, self._axes, self._depth, self._field.size, candidates.sorted, write, first]
-            wp.launch(counting_kernel.list_field_kernel, len(views), inputs, outputs, device=self.device)
-            return
-        least = wp.float64(MIN_DEPTH_M)
-        inputs = [asked, self._axes, self._sides, candidates.sorted, self._rounding, least, write, first]
-        wp.launch(counting_kernel.list_kernel, len(views), inputs, outputs, device=self.device)
+            kernel, inputs = counting_kernel.list_field_kernel, [self._depth, self._field.size, *shared]
+        else:
+            least = wp.float64(MIN_DEPTH_M)
+            kernel, inputs = counting_kernel.list_kernel, [self._sides, self._rounding, least, *shared]
+        wp.launch(kernel, len(views), [*rotations, *inputs], outputs, device=self.device)
+        return np.asarray(outputs[0].numpy()), outputs[1], outputs[2]
 
 
 @dataclass(frozen=True, eq=False)

@@ -160,6 +160,7 @@ class SortedLandmarks:
     border: wp.array[wp.vec2i]
     starts: wp.array[wp.int32]  # first entry of each cell of each location in `offsets`
     offsets: wp.array[wp.vec3]  # from the location
+    rows: wp.array[wp.int32]  # which landmark each entry is, if entries are listed
 
 
 @wp.func
@@ -329,52 +330,70 @@ def list_inside(
     landmarks: SortedLandmarks,
     location: wp.int32,
     orientation: wp.int32,
+    stride: wp.int32,
     rotation: wp.mat33,
-    write: wp.bool,
     begin: wp.int64,
+    end: wp.int64,
     entries: wp.array[wp.int32],
     image: wp.array[wp.vec2],
 ) -> wp.int64:
-    """Count, and with `write` list from `begin` on, the landmarks of cells that are wholly in view."""
-    number = wp.int64(0)
+    """Count, and list from `begin` to `end`, the landmarks of cells that are wholly in view."""
+    at = begin
     runs = inside_runs(landmarks, orientation)
     for run in range(runs[0], runs[1]):
         span = entries_of(landmarks, location, landmarks.inside[run])
-        if write:
+        if begin == end and stride == 1:
+            at += wp.int64(span[1] - span[0])
+        else:
             for entry in range(span[0], span[1]):
-                at = begin + number + wp.int64(entry - span[0])
-                entries[at] = entry
-                image[at] = image_of(rotation, landmarks.offsets[entry])
-        number += wp.int64(span[1] - span[0])
-    return number
+                if landmarks.rows[entry] % stride == 0:
+                    at = list_one(at, end, entry, landmarks.offsets[entry], rotation, entries, image)
+    return at
+
+
+@wp.func
+def list_one(
+    at: wp.int64,
+    end: wp.int64,
+    entry: wp.int32,
+    offset: wp.vec3,
+    rotation: wp.mat33,
+    entries: wp.array[wp.int32],
+    image: wp.array[wp.vec2],
+) -> wp.int64:
+    """Write a landmark where there is room, and return the next place."""
+    if at < end:
+        entries[at] = entry
+        image[at] = image_of(rotation, offset)
+    return at + wp.int64(1)
 
 
 @wp.kernel
 def list_kernel(
-    views: wp.array[wp.vec2i],
+    views: wp.array[wp.vec3i],
     rotations: wp.array[wp.mat33],
     sides: wp.array2d[wp.vec3],
-    landmarks: SortedLandmarks,
     rounding: wp.float32,
     min_depth: wp.float64,
-    write: wp.bool,
-    first: wp.array[wp.int64],
+    landmarks: SortedLandmarks,
+    ends: wp.array[wp.int64],
     lengths: wp.array[wp.int64],
     entries: wp.array[wp.int32],
     image: wp.array[wp.vec2],
 ):
-    """Count the landmarks in view of each view, a location and an orientation; with `write`, list them from `first` on.
+    """Count the landmarks in view of each view, and list as many as there is room for, from `ends[view]` on.
 
-    The test is that of `count_kernel`.
+    A view is a location, an orientation and a stride: only landmarks whose rows it divides count. The test is that of
+    `count_kernel`.
     """
     view = wp.tid()
     location = views[view][0]
     orientation = views[view][1]
-    begin = wp.int64(0)
-    if write:
-        begin = first[view]
+    stride = views[view][2]
+    begin = ends[view]
+    end = ends[view + 1]
     rotation = rotations[orientation]
-    number = list_inside(landmarks, location, orientation, rotation, write, begin, entries, image)
+    at = list_inside(landmarks, location, orientation, stride, rotation, begin, end, entries, image)
     left = sides[orientation, 0]
     right = sides[orientation, 1]
     top = sides[orientation, 2]
@@ -383,31 +402,27 @@ def list_kernel(
     for run in range(runs[0], runs[1]):
         span = entries_of(landmarks, location, landmarks.border[run])
         for entry in range(span[0], span[1]):
-            offset = landmarks.offsets[entry]
-            if surely_in_sides(left, right, top, bottom, offset, rounding):
-                if write:
-                    entries[begin + number] = entry
-                    image[begin + number] = image_of(rotation, offset)
-                number += wp.int64(1)
+            if landmarks.rows[entry] % stride == 0:
+                offset = landmarks.offsets[entry]
+                if surely_in_sides(left, right, top, bottom, offset, rounding):
+                    at = list_one(at, end, entry, offset, rotation, entries, image)
     span = near_entries(landmarks, location)
     for entry in range(span[0], span[1]):
-        if in_view(sides, orientation, landmarks.offsets[entry], min_depth):
-            if write:
-                entries[begin + number] = entry
-                image[begin + number] = image_of(rotation, landmarks.offsets[entry])
-            number += wp.int64(1)
-    lengths[view] = number
+        if landmarks.rows[entry] % stride == 0:
+            offset = landmarks.offsets[entry]
+            if in_view(sides, orientation, offset, min_depth):
+                at = list_one(at, end, entry, offset, rotation, entries, image)
+    lengths[view] = at - begin
 
 
 @wp.kernel
 def list_field_kernel(
-    views: wp.array[wp.vec2i],
+    views: wp.array[wp.vec3i],
     rotations: wp.array[wp.mat33],
     depth: wp.array[wp.float32],
     field_size: wp.int32,
     landmarks: SortedLandmarks,
-    write: wp.bool,
-    first: wp.array[wp.int64],
+    ends: wp.array[wp.int64],
     lengths: wp.array[wp.int64],
     entries: wp.array[wp.int32],
     image: wp.array[wp.vec2],
@@ -416,26 +431,23 @@ def list_field_kernel(
     view = wp.tid()
     location = views[view][0]
     orientation = views[view][1]
-    begin = wp.int64(0)
-    if write:
-        begin = first[view]
+    stride = views[view][2]
+    begin = ends[view]
+    end = ends[view + 1]
     rotation = rotations[orientation]
-    number = list_inside(landmarks, location, orientation, rotation, write, begin, entries, image)
+    at = list_inside(landmarks, location, orientation, stride, rotation, begin, end, entries, image)
     runs = border_runs(landmarks, orientation)
     for run in range(runs[0], runs[1]):
         span = entries_of(landmarks, location, landmarks.border[run])
         for entry in range(span[0], span[1]):
-            offset = landmarks.offsets[entry]
-            inside_by = depth[cell_of(rotation * offset, field_size)]
-            if inside_by >= 0.0:
-                if write:
-                    entries[begin + number] = wp.where(inside_by > 0.0, entry, -1 - entry)
-                    image[begin + number] = image_of(rotation, offset)
-                number += wp.int64(1)
+            if landmarks.rows[entry] % stride == 0:
+                offset = landmarks.offsets[entry]
+                inside_by = depth[cell_of(rotation * offset, field_size)]
+                if inside_by >= 0.0:
+                    listed = wp.where(inside_by > 0.0, entry, -1 - entry)
+                    at = list_one(at, end, listed, offset, rotation, entries, image)
     span = near_entries(landmarks, location)
     for entry in range(span[0], span[1]):
-        if write:
-            entries[begin + number] = -1 - entry
-            image[begin + number] = image_of(rotation, landmarks.offsets[entry])
-        number += wp.int64(1)
-    lengths[view] = number
+        if landmarks.rows[entry] % stride == 0:
+            at = list_one(at, end, -1 - entry, landmarks.offsets[entry], rotation, entries, image)
+    lengths[view] = at - begin

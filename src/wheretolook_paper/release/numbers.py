@@ -223,6 +223,15 @@ class Numbers:
 
         return cells
 
+    def masked(self, label: str) -> list[str]:
+        scene, _, path = label.partition(": ")
+        method = {"shortest, ahead": "forward", "shortest, chosen": "set", "on the mask, chosen": "mask"}[path]
+        row = self.row(
+            "nav2.csv", scene={"house": "aws_house", "game level": "nexuiz_dieselpower"}[scene], method=method
+        )
+        turned = f"{row['turn_deg_per_m']:.0f}°/m"
+        return [interval_text(row, "localized"), f"{row['length_m']:.2f}", turned, f"{row['pairs']}"]
+
     def relocalized(self, label: str) -> list[str]:
         row = self.row("relocalize.csv", policy=POLICIES[label])
         joint = [
@@ -340,6 +349,10 @@ def tables(numbers: Numbers) -> Mapping[tuple[str, str], Cells]:
             "docs/extend.md",
             "| photographs | none | a longer walk | random | even spread | lowest score | pairs | above random | above even |",
         ): numbers.extended_photographs,
+        (
+            "docs/nav2.md",
+            "| path, views | localized, % of the way | mean length, m | turning | pairs |",
+        ): numbers.masked,
         ("docs/looks.md", "| views | one | two | three | five | any of five alone |"): numbers.looks,
     }
 

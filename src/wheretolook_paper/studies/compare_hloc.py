@@ -44,6 +44,7 @@ from wheretolook.commands.options import MeshSource, ScenesConfig
 from wheretolook.commands.sample import Sample
 from wheretolook.commands.scenes import Scenes
 from wheretolook.dataset.config import Accuracy, SampleConfig
+from wheretolook.dataset.layout import Dataset, SceneFolder
 from wheretolook.dataset.scene import Scene
 from wheretolook.dataset.viewpoint_table import poses as poses_of_table
 from wheretolook.evaluation.config import EvaluateConfig
@@ -160,8 +161,8 @@ def main(
     return table
 
 
-def render_set(source: str, locations: int, images: int, work: Path, workers: int = 1, device: str = "cpu") -> Path:
-    """Map a mesh or a generated scene, render the queries, and return the folder of the set, which is reused.
+def map_source(source: str, images: int, work: Path, workers: int = 1, device: str = "cpu") -> SceneFolder:
+    """Map a mesh or a generated scene by rendered images, as a dataset of one scene in `work`, which is reused.
 
     Raises ConfigError if the source is neither.
     """
@@ -173,14 +174,24 @@ def render_set(source: str, locations: int, images: int, work: Path, workers: in
     else:
         fix = f"Name a folder, a mesh file, or one of {', '.join(get_args(SceneKind))} with a seed: building-700."
         raise ConfigError("there is no such set", value=source, fix=fix)
-    out = work / f"{Path(source).stem}-{images}-{locations}"
-    if (out / "queries.txt").is_file():
-        return out
     dataset: dict[str, Any] = {"data": work, "name": f"scene-{Path(source).stem}", "device": device}
     Scenes(**dataset, scenes=scenes).run()
     BuildMap(**dataset, mapping=MapConfig(n_images=images, keep_images=True), label=LabelConfig(workers=workers)).run()
+    (scene,) = Dataset.load(work / dataset["name"]).scenes
+    return scene
+
+
+def render_set(source: str, locations: int, images: int, work: Path, workers: int = 1, device: str = "cpu") -> Path:
+    """Map a mesh or a generated scene, render the queries, and return the folder of the set, which is reused.
+
+    Raises ConfigError if the source is neither.
+    """
+    out = work / f"{Path(source).stem}-{images}-{locations}"
+    if (out / "queries.txt").is_file():
+        return out
+    mapped = map_source(source, images, work, workers, device)
     sample = SampleConfig(keep=0, max_locations=locations, max_directions=DIRECTIONS)
-    (scene,) = Sample(**dataset, sample=sample).run().scenes
+    (scene,) = Sample(data=work, name=mapped.folder.parent.name, device=device, sample=sample).run().scenes
     table = scene.read_table()
     weights = resolve_weights()
     assert weights is not None

@@ -185,6 +185,18 @@ def steps(
             (SET,),
             needs="photographs",
         ),
+        **{
+            f"nav2-{scene}": Step(
+                [
+                    *mapped("test-90"),
+                    study("nav2", "--dataset", "data/test-90", "--scene", scene, "--pairs", pairs,
+                          "--out", str(RESULTS / "nav2.csv"), "--device", device),
+                ],
+                (SET,),
+                needs="meshes",
+            )
+            for scene, pairs in (("aws_house", "12"), ("nexuiz_dieselpower", "5"))
+        },
         "kitchen": Step([checked("kitchen", "--poses", "kitchen", *tabled)], (SET, MATCHABILITY), needs="photographs"),
         "fox": Step([checked("fox", "--images", "fox", *tabled)], (SET, MATCHABILITY), needs="photographs"),
         "plan-kitchen": Step(

@@ -4,41 +4,30 @@ from __future__ import annotations
 
 import warnings
 from bisect import bisect_left
-from concurrent.futures import ThreadPoolExecutor
 from copy import copy, deepcopy
 from dataclasses import replace
-from math import exp, log
-from threading import Lock
+from math import exp
 from typing import Self
 
 import numpy as np
 import torch
-import warp as wp
 from numpy.typing import NDArray
 from torch import Tensor
 
 from wheretolook.dataset.config import Accuracy, checked_accuracy, threshold_key
 from wheretolook.geometry.camera import Camera
 from wheretolook.geometry.lattices import spread_rows
-from wheretolook.geometry.poses import Float, check_locations, check_poses, rotation_looking_along
+from wheretolook.geometry.poses import Float, check_poses
 from wheretolook.geometry.views import Views
-from wheretolook.inputs.landmark_features import LandmarkDescriber, ViewLandmarks, ragged_blocks
+from wheretolook.inputs.landmark_features import LandmarkDescriber, ViewLandmarks
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.colmap_model import observation_matrix, select_points
-from wheretolook.mapping.landmarks import MAP_ATTRIBUTES
 from wheretolook.mapping.map import Map
 from wheretolook.mapping.track_errors import log_error_ratio
 from wheretolook.scorers.base import LandmarkProbabilities, Scorer
 from wheretolook.scorers.set.accuracy import model_of, probabilities, statistics_of
-from wheretolook.scorers.set.network import (
-    N_EXPECTED,
-    SetNetwork,
-    ViewSums,
-    along,
-    bearing_precision,
-    expected_cells,
-    precision_of_track,
-)
+from wheretolook.scorers.set.directions import BatchedDirections
+from wheretolook.scorers.set.network import SetNetwork, bearing_precision
 from wheretolook.training.trained_network import (
     RangeWatch,
     TrainedNetwork,
@@ -46,201 +35,9 @@ from wheretolook.training.trained_network import (
     camera_quantities,
     view_quantities,
 )
-from wheretolook.utils.processes import cores
-from wheretolook.visibility.counting import FrustumLister, ListedViews, Surroundings, choose_size
+from wheretolook.utils.errors import MapWarning
 from wheretolook.visibility.frustum import LandmarkSets
-from wheretolook.visibility.occlusion import CachedOcclusion, DevicePoints, StoredOcclusion
-
-OF_LOCATION = ("distance", "mapped_angle", "distance_ratio", "pixel_size_ratio")
-"""Attributes of a landmark that depend on the camera's location, but not on its orientation."""
-
-OF_IMAGE = ("across", "down")
-"""Attributes of a landmark that depend on the camera's orientation."""
-
-
-class BatchedDirections:
-    """Scores the same directions (D, 3), unit vectors in the world, at any location.
-
-    A view of more than `limit` landmarks is scored from every second of the map's, every fourth, and so on, along a
-    curve through space (`DevicePoints`), so that between half of `limit` and `limit` remain.
-    """
-
-    def __init__(
-        self,
-        localization_map: LocalizationMap,
-        trained: TrainedNetwork[SetNetwork],
-        directions: Float,
-        limit: int,
-        accuracy: Accuracy,
-    ) -> None:
-        self.localization_map = localization_map
-        self.trained = trained
-        self.directions = directions
-        self.limit = limit
-        self.accuracy = accuracy
-        self.rotations = rotation_looking_along(directions)
-        landmarks = localization_map.landmarks
-        matchability = trained.network.matchability
-        self.points = DevicePoints(landmarks.points, localization_map.device)
-        names = matchability.attributes
-        first, self._second, self._last = (layer for layer in matchability.layers if isinstance(layer, torch.nn.Linear))
-        mean = matchability.input.mean
-        self.device = mean.device
-        self._pixel_angle = -log(localization_map.camera.mean_focal_px)
-        with torch.inference_mode():
-            weight = first.weight * matchability.input.scale
-            self._of_image = _columns(weight, names, OF_IMAGE)
-            self._of_location = _columns(weight, names, OF_LOCATION)
-            self._mean = _columns(mean[None], names, OF_LOCATION)[:, 0]
-            of_map = torch.from_numpy(landmarks.attributes()[self.points.order]).to(self.device)
-            # the first layer of what depends on the map alone: the other columns are at their means, so 0
-            values = mean.repeat(len(of_map), 1)
-            for column, name in enumerate(names):
-                if name in MAP_ATTRIBUTES:
-                    values[:, column] = of_map[:, MAP_ATTRIBUTES.index(name)]
-                elif name == "pixel_angle":
-                    values[:, column] = self._pixel_angle
-            # the kernels give `across` and `down` as they are: their means are subtracted here
-            means_of_image = _columns(mean[None], names, OF_IMAGE)[:, 0] @ self._of_image
-            self._first = first(matchability.input(values)) - means_of_image
-            mapped = [MAP_ATTRIBUTES.index(name) for name in ("mapped_distance", "mapped_pixel_size")]
-            mapped_from = torch.from_numpy(landmarks.mapping_direction[self.points.order]).to(self.device)
-            track, spread = (of_map[:, [MAP_ATTRIBUTES.index(name)]] for name in ("track_length", "direction_spread"))
-            self._mapped = torch.cat([mapped_from, of_map[:, mapped], (-track).exp(), along(spread)], 1)
-        with warnings.catch_warnings():  # PyTorch warns once that sparse matrices are new
-            warnings.simplefilter("ignore")
-            torch.sparse_csr_tensor([0, 0], [], [], size=(1, 1))
-        self._listers: dict[int, FrustumLister] = {}  # by the number of cells along a side
-        self._lock = Lock()
-
-    def score(self, locations: Float) -> Float:
-        """Return scores (L, D) at locations (L, 3) m; a PoseError if one is not finite."""
-        locations = check_locations(locations)
-        scores = np.empty((len(locations), len(self.rotations)))
-        # landmarks times locations in a block
-        step = 1 if self.device.type == "cpu" else max(1, (1 << 23) // max(1, len(self.points)))
-        blocks = [slice(begin, begin + step) for begin in range(0, len(locations), step)]
-
-        def work(rows: slice) -> None:
-            with torch.inference_mode():
-                scores[rows] = self._score(locations[rows])
-
-        if self.device.type != "cpu":
-            for rows in blocks:
-                work(rows)
-            return scores
-        threads = torch.get_num_threads()
-        pool = ThreadPoolExecutor(cores(), initializer=torch.set_num_threads, initargs=(1,))
-        try:
-            with pool:  # blocks are small: each thread has its own
-                list(pool.map(work, blocks))
-        finally:
-            torch.set_num_threads(threads)
-        return scores
-
-    def _score(self, locations: Float) -> Float:
-        n_directions = len(self.rotations)
-        double = self.points.double
-        mask = self.localization_map.occlusion.unoccluded_on_device(locations, self.points)
-        pairs = np.stack(np.divmod(np.arange(len(locations) * n_directions), n_directions), axis=1)
-        lister = self._lister(0)
-        nearby = lister.surroundings(locations, double, mask)
-        in_view = lister.lengths(nearby, pairs)
-        halvings = np.ceil(np.log2(np.maximum(in_view, 1) / self.limit)).clip(0).astype(int)
-        scores = np.empty(len(pairs))
-        for level in np.unique(halvings).tolist():
-            stride = 1 << level
-            views = np.flatnonzero(halvings == level)
-            lengths = in_view[views]
-            if level:
-                lister = self._lister(level)
-                part = None if mask is None else mask[:, ::stride].contiguous()
-                nearby = lister.surroundings(locations, double[::stride].contiguous(), part)
-                lengths = lister.lengths(nearby, pairs[views])
-            listed = lister.list(nearby, pairs[views], lengths)
-            # where the camera itself excludes landmarks, the share of a sample that remains is that of all
-            n_visible = np.diff(listed.starts) / np.maximum(lengths, 1) * in_view[views]
-            if self.device.type != "cpu":
-                wp.synchronize_device(self.points.device)  # Torch works on a stream of its own
-            scores[views] = self._of_listed(listed, nearby, stride, n_visible)
-        return scores.reshape(-1, n_directions)
-
-    def _lister(self, level: int) -> FrustumLister:
-        """The lister for every 2^level-th landmark. Few landmarks share one: to make its cells takes 70 ms of a core."""
-        # 64 at least: of larger cells too many are on the border of a view
-        size = max(64, choose_size(len(self.points) >> level))
-        with self._lock:
-            if size not in self._listers:
-                camera = self.localization_map.camera
-                self._listers[size] = FrustumLister(
-                    camera, self.rotations, 0, self.points.device, size=size, scratch_bytes=1 << 24
-                )
-            return self._listers[size]
-
-    def _of_listed(self, listed: ListedViews, nearby: Surroundings, stride: int, n_visible: Float) -> Float:
-        """Return scores (V,) of listed views of `n_visible` (V,) landmarks in all."""
-        starts = listed.starts
-        entries = wp.to_torch(listed.entries)
-        image = wp.to_torch(listed.image)
-        rows = wp.to_torch(nearby.rows)
-        used = torch.zeros(len(rows), dtype=torch.bool, device=self.device)
-        used[entries] = True
-        place = used.cumsum(0, dtype=torch.int32) - 1
-        seen = used.nonzero()[:, 0]
-        base, terms = self._described(wp.to_torch(nearby.offsets).index_select(0, seen), rows[seen] * stride)
-        sums = torch.zeros((len(n_visible), N_EXPECTED), device=self.device)
-        cells = torch.zeros(len(n_visible), device=self.device)
-        visible = torch.from_numpy(n_visible).to(sums)
-        each = visible / torch.from_numpy(np.diff(starts)).to(self.device).clamp(min=1)
-        at_once = 1 << 13 if self.device.type == "cpu" else 1 << 22  # fits the cache, or takes 2 GB
-        for views in ragged_blocks(starts, at_once):
-            part = starts[views.start : views.stop + 1]
-            span = slice(int(part[0]), int(part[-1]))
-            here = place[entries[span]]
-            hidden = base.index_select(0, here).addmm_(image[span], self._of_image).relu_()
-            hidden = torch.mm(hidden, self._second.weight.T).add_(self._second.bias).relu_()
-            log_odds = torch.mv(hidden, self._last.weight[0]).add_(self._last.bias)
-            ends = torch.from_numpy((part - part[0]).astype(np.int32)).to(self.device)
-            p_detect = torch.sparse_csr_tensor(ends, here, log_odds.sigmoid(), size=(len(part) - 1, len(terms)))
-            sums[views] = p_detect @ terms
-            of_view = torch.arange(len(part) - 1, device=self.device).repeat_interleave(ends.diff())
-            cells[views] = expected_cells(image[span], log_odds, of_view, each[views], OF_IMAGE)
-        return probabilities(self.trained, self.accuracy, ViewSums(sums * each[:, None], visible, cells))
-
-    def _described(self, offsets: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the first layer (M, W) of landmarks without their position in the image, and their terms of sums.
-
-        The landmarks are at offsets (M, 3) m from the location, and at rows (M,) of the points.
-        """
-        mapped = self._mapped.index_select(0, rows)
-        distance = offsets.norm(dim=1)
-        log_distance = distance.log()
-        bearing = offsets / distance[:, None]
-        angle = (bearing * mapped[:, :3]).sum(1)
-        size_ratio = log_distance + self._pixel_angle - mapped[:, 4]
-        values = torch.stack([log_distance, angle, log_distance - mapped[:, 3], size_ratio], 1)
-        base = self._first.index_select(0, rows).addmm_((values - self._mean).nan_to_num_(nan=0.0), self._of_location)
-        pixels = torch.stack([torch.full_like(size_ratio, self._pixel_angle), size_ratio], 1)
-        weight = bearing_precision(pixels, ("pixel_angle", "pixel_size_ratio"))
-        x, y, z = bearing.unbind(1)
-        terms = torch.empty((len(x), N_EXPECTED), device=self.device)
-        terms[:, 0] = 1
-        plane = terms[:, 10:16]
-        for column, number in enumerate((1 - x * x, -x * y, -x * z, 1 - y * y, -y * z, 1 - z * z)):
-            torch.mul(number, weight, out=plane[:, column])
-        inverse = distance.reciprocal()
-        torch.mul(plane, inverse.square()[:, None], out=terms[:, 1:7])
-        torch.mul(bearing, (inverse * weight)[:, None], out=terms[:, 7:10])
-        of_track, excess = mapped[:, 5:].unbind(1)
-        terms[:, 17] = precision_of_track(pixels[:, 0], size_ratio, angle, of_track, excess)
-        torch.mul(terms[:, 17], inverse.square(), out=terms[:, 16])
-        return base, terms
-
-
-def _columns(weight: Tensor, names: tuple[str, ...], wanted: tuple[str, ...]) -> Tensor:
-    """Return columns of a weight (W, A) by name, transposed (len(wanted), W); 0 for attributes it does not have."""
-    zero = torch.zeros_like(weight[:, 0])
-    return torch.stack([weight[:, names.index(name)] if name in names else zero for name in wanted])
+from wheretolook.visibility.occlusion import CachedOcclusion, StoredOcclusion
 
 
 class LandmarkScorer(Scorer):
@@ -263,14 +60,14 @@ class LandmarkScorer(Scorer):
         self.training_range = TrainingRange.of_camera(camera) if training_range is None else training_range
         self.describer = LandmarkDescriber(localization_map, attributes)
         self._of_camera = camera_quantities(localization_map.camera)
-        self._serves_camera = bool(self.training_range.contains(self._of_camera[None])[0])
-        self._watch = RangeWatch(self.training_range.bounds_landmarks or not self._serves_camera)
+        self.serves_camera = bool(self.training_range.contains(self._of_camera[None])[0])
+        self._watch = RangeWatch(self.training_range.bounds_landmarks or not self.serves_camera)
 
     def in_range(self, cam_from_world: Float) -> NDArray[np.bool_]:
         """Return which poses (B, 3, 4) have views like the training views, (B,) bool."""
         cam_from_world = check_poses(cam_from_world)
-        inside = np.full(len(cam_from_world), self._serves_camera)
-        if self._serves_camera and self.training_range.bounds_landmarks:
+        inside = np.full(len(cam_from_world), self.serves_camera)
+        if self.serves_camera and self.training_range.bounds_landmarks:
             for rows, described, n_visible in self.describer.in_blocks(cam_from_world, self.max_landmarks):
                 inside[rows] = self._in_range(described, n_visible)
         return inside
@@ -328,7 +125,11 @@ def error_scale(localization_map: LocalizationMap) -> float:
     """
     whole = localization_map.map.whole or localization_map.map
     if "error_scale" not in whole.computed:
-        noise_px = max(0.1, whole.landmarks.keypoint_noise_px)
+        noise_px = whole.landmarks.keypoint_noise_px
+        if noise_px is None:
+            text = "no landmark has a reprojection error: keypoints count as precise to a pixel"
+            warnings.warn(f"{whole.path or 'map'}: {text}", MapWarning, stacklevel=2)
+        noise_px = max(0.1, noise_px or 1.0)
         ratio = None if whole.images is None else log_error_ratio(whole.images, whole.cameras, noise_px)
         whole.computed["error_scale"] = noise_px * (1.0 if ratio is None else exp(0.4 * (ratio - 0.27)))
     return float(whole.computed["error_scale"])
@@ -454,7 +255,7 @@ class SetScorer(LandmarkScorer):
         expected_inliers = np.zeros(n)
         errors = np.empty((n, 2))
         n_visible = np.zeros(n, dtype=np.int64)
-        in_range = np.full(n, self._serves_camera)
+        in_range = np.full(n, self.serves_camera)
         out_of_range = np.full(n, "", dtype=object)
         for rows, described, visible in self.describer.in_blocks(cam_from_world, MAX_LANDMARKS):
             views = self.network.sums_of(described, visible)
@@ -495,9 +296,9 @@ class SetScorer(LandmarkScorer):
         return log_odds
 
     def score_directions(self, locations: Float, directions: Float) -> Float:
-        """Return probabilities (L, D); where many landmarks are visible, from a smaller sample than `score`."""
+        """Return probabilities (L, D); where many landmarks are visible, from another sample than `score`."""
         if self._batched is None or not np.array_equal(self._batched.directions, directions):
             self._batched = BatchedDirections(
-                self.localization_map, self.trained, directions, MAX_LANDMARKS // 2, self.accuracy
+                self.localization_map, self.trained, directions, MAX_LANDMARKS, self.accuracy
             )
         return self._batched.score(locations)

@@ -64,7 +64,7 @@ def log_extend(tracking: TrackingConfig, dataset: str, results: Path, tags: Tags
     file = results / EXTEND_CSV
     names: Sequence[str] = ("strict", "coarse", "gain", "gain_low", "gain_high", "won", "lost", "views")
     metrics = {
-        str(row["policy"]): {name: float(row[name]) for name in names}
+        str(row["policy"]): {name: float(row[name]) for name in names if pd.notna(row[name])}
         for row in policies(pd.read_csv(file)).to_dict("records")
     }
     nested = [NestedRun(name, {"dataset": dataset, "policy": name}, of_policy) for name, of_policy in metrics.items()]

@@ -63,7 +63,7 @@ def _draw_registrations(axes: Axes, rows: pd.DataFrame) -> None:
     means, counts = groups.mean(), groups.size()
     axes.plot(means["p"], means["registered"], "o-", color=VERMILION)
     for (_, row), count in zip(means.iterrows(), counts, strict=True):
-        axes.annotate(str(count), (row["p"], row["registered"]), (5, -10), textcoords="offset points")
+        axes.annotate(str(count), (row["p"], row["registered"]), (-10, 7), textcoords="offset points")
     axes.axline((0, 0), slope=1, color=INK, linewidth=0.8)
     axes.set(xlabel="P registers", ylabel="share that registers", title="photographs, and their number")
     axes.set(xlim=(0, 1), ylim=(0, 1.02), aspect="equal")

@@ -94,7 +94,13 @@ def test_it_carries_all_modules_and_what_they_need(wheel):
         for name in ("set", "matchability", "mlp-2d+z", "aliked/set", "aliked/matchability")
         for suffix in ("json", "safetensors")
     }
-    fitted = ("localization/confidence", "looks/set_score", "scorers/set/accuracy")
+    fitted = (
+        "localization/confidence",
+        "localization/missing",
+        "looks/set_score",
+        "scorers/set/accuracy",
+        "scorers/set/photographs",
+    )
     numbers = {f"wheretolook/{name}.json" for name in fitted}
     assert files == {*modules, *configs, *weights, *numbers, "wheretolook/py.typed"}
     assert metadata["License-Expression"] == "Apache-2.0" and "wheretolook = wheretolook.cli:main" in points

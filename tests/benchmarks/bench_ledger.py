@@ -6,7 +6,8 @@
 Run it before finishing a change to a kernel or to its caller. Sizes are the paper's (`bench_visibility.py`), on a CPU with
 every twentieth location, and 25,000 landmarks for `select`, whose process is timed from start to end. Localizing is of one
 image by several hypotheses on one core (matching on the device): a tenth of its keypoints show landmarks, half of which
-have a twin elsewhere.
+have a twin elsewhere. A viewpoint map without a mesh is of 2,013 landmarks by hidden-point removal, and `check` of a
+corridor of 30 photographs.
 """
 
 import itertools
@@ -22,16 +23,20 @@ import numpy as np
 import pandas as pd
 import warp as wp
 from bench_visibility import CAMERA, COUNTS, EVERYTHING, Setup, machine
-from common import options, room_map, seconds_of, show, use_one_thread, write_csv, write_model, write_waypoints
+from common import ROOM_M, options, room_map, seconds_of, show, use_one_thread, write_csv, write_model, write_waypoints
 
+from holdout.corridor import write_corridor
 from wheretolook.features.extractor import Keypoints, quantize_descriptors
-from wheretolook.geometry.lattices import fibonacci_sphere
+from wheretolook.geometry.lattices import VoxelGrid, fibonacci_sphere
 from wheretolook.geometry.poses import poses_looking_along, rotation_looking_along, transform
 from wheretolook.localization.config import LocalizerConfig
 from wheretolook.localization.localizer import Localizer
+from wheretolook.planning.scene_map import build_viewpoint_map
+from wheretolook.scorers.weights import load_scorer
 from wheretolook.utils.warp import start_warp
 from wheretolook.visibility.counting import SurveyOptions, survey
-from wheretolook.visibility.occlusion import DevicePoints, NoOcclusion
+from wheretolook.visibility.hidden_points import HiddenPointRemoval
+from wheretolook.visibility.occlusion import CachedOcclusion, DevicePoints, NoOcclusion
 
 LEDGER = Path(__file__).with_name("ledger.csv")
 KEYPOINTS = 2000
@@ -70,6 +75,41 @@ def select(args, device, folder):
         command += ["--out", "views.csv", "--occlusion", "none", "--device", device]
         work = partial(subprocess.run, command, cwd=folder, check=True, capture_output=True)
         yield f"select, {number} waypoints x 500 x {args.landmarks:,}, process", work
+
+
+def scores(args, device):
+    """Yield names and work of scoring all directions, and of a viewpoint map without a mesh."""
+    rng = np.random.default_rng(0)
+    low, high = np.array(ROOM_M) * 0.8
+    axes = fibonacci_sphere(500)
+    count = args.locations or (648 if setup_on_gpu(device) else 32)
+    locations = rng.uniform(low, high, (count, 3))
+    scorer = load_scorer(room_map(args.landmarks, locations, device))
+    scorer.score_directions(locations[:1], axes)  # on every core
+    yield f"scores of directions: {count} x 500 x {args.landmarks:,}", partial(scorer.score_directions, locations, axes)
+    few = min(2_013, args.landmarks)
+    grid = VoxelGrid.over(np.array([low, high]), (6, 6, 7))
+    voxels = np.arange(args.locations or 246)
+
+    def viewpoint_map():  # occlusion is computed each time
+        hidden = replace(room_map(few, locations[:1], device), occlusion=CachedOcclusion(HiddenPointRemoval()))
+        build_viewpoint_map(load_scorer(hidden), grid, voxels, axes)
+
+    yield f"viewpoint map without a mesh: {len(voxels)} x 500 x {few:,}", viewpoint_map
+
+
+def check(folder):
+    """Return the work of `wheretolook check` on one core."""
+    sparse, database = write_corridor(folder)
+    command = [sys.executable, "-m", "wheretolook", "check", "--map", sparse, "--database", database, "--scale", "1"]
+    command += ["--occlusion", "none", "--workers", "1", "--device", "cpu"]
+    numbers = itertools.count()
+
+    def work():
+        out = folder / f"out-{next(numbers)}"  # results are kept
+        subprocess.run([*map(str, command), "--out", str(out)], cwd=folder, check=True, capture_output=True)
+
+    return work
 
 
 def localization(args, device):
@@ -135,11 +175,12 @@ def main():
         show(what, times, f"{times['median_s'] / last['median_s']:.2f} of {last['commit']}" if last else "first entry")
 
     print(f"{name}, {commit()}")
-    for what, work in itertools.chain(visibility(args, device), localization(args, device)):
+    for what, work in itertools.chain(visibility(args, device), scores(args, device), localization(args, device)):
         add(what, work, args.repeats)
     with tempfile.TemporaryDirectory() as folder:
         for what, work in select(args, args.device, Path(folder)):
             add(what, work, max(1, args.repeats // 5))
+        add("check, 30 photographs, process", check(Path(folder, "corridor")), max(1, args.repeats // 10))
     if args.record:
         earlier = [pd.read_csv(args.ledger, dtype={"commit": str})] if args.ledger.exists() else []
         write_csv(pd.concat([*earlier, pd.DataFrame(rows)[[*COLUMNS]]]), args.ledger)

@@ -72,7 +72,7 @@ def test_the_ledger_compares_with_the_last_entry(tmp_path):
     ledger = tmp_path / "ledger.csv"
     assert "first entry" in run("ledger", *sizes.split(), "--ledger", str(ledger), "--record")
     assert "first entry" not in run("ledger", *sizes.split(), "--ledger", str(ledger))
-    assert len(ledger.read_text().splitlines()) == 8
+    assert len(ledger.read_text().splitlines()) == 11
 
 
 def test_every_benchmark_is_run():

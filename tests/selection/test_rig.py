@@ -13,11 +13,13 @@ from selection.room import POINTS, WEIGHTS, write_room
 from wheretolook.cli import main
 from wheretolook.geometry.pose_files import tum_text
 from wheretolook.geometry.poses import compose_poses, poses_looking_along
+from wheretolook.looks.selection import SetScoreModel, candidate_views, score_of_set
 from wheretolook.select.where_to_look import WhereToLook
 from wheretolook.utils.errors import CameraError, ConfigError, TableError
 
 PINHOLE = "PINHOLE,640,480,320,320,320,240"
-POSES = poses_looking_along(POINTS, [(1, 0.2, 0)])
+AXIS = np.array([(1, 0.2, 0)]) / np.hypot(1, 0.2)
+POSES = poses_looking_along(POINTS, AXIS)
 
 
 def turned(degrees, x=0.0):
@@ -34,11 +36,16 @@ def write_rig(path, angles, camera=PINHOLE):
 
 def test_a_rig_of_one_camera_scores_as_the_camera_and_the_camera_twice_no_more(look, tmp_path):
     expected = look.report(POSES)
+    detections = [
+        candidate_views(look.scorer, at, AXIS, scores[None]) for at, scores in zip(POINTS, expected.score, strict=True)
+    ]
+    of_sets = [score_of_set(found, SetScoreModel.bundled(), [0]) for found in detections]
     for names in (["a"], ["a", "b"]):
         views = look.report_rig(write_rig(tmp_path / "rig.yaml", dict.fromkeys(names, 0.0)), POSES)
         assert views.sensor == (*names,) * 4 and views.rank.tolist() == [*range(1, len(names) + 1)] * 4
-        for found in (views.score, views.any_score, views.set_score):
+        for found in (views.score, views.any_score):
             assert_allclose(found.reshape(4, -1), np.tile(expected.score[:, None], len(names)), rtol=1e-6)
+        assert_allclose(views.set_score.reshape(4, -1), np.tile(np.c_[of_sets], len(names)), rtol=1e-5)
 
 
 def test_cameras_that_see_different_landmarks_fail_independently(look, tmp_path):

@@ -14,7 +14,6 @@ from wheretolook.mapping.config import FrameOptions
 from wheretolook.scorers.weights import load_scorer, resolve_weights
 from wheretolook.select.waypoints import grid_waypoints
 from wheretolook.utils.errors import ConfigError, check_positive
-from wheretolook.utils.package import or_shipped
 
 MAX_LOCATIONS = 20_000
 
@@ -82,7 +81,7 @@ class Export(CameraOptions, MeshOptions, FrameOptions):
         camera = pinhole_of(source.camera)
         if camera != source.camera:
             print("the map's camera has distortion, the robot's is the pinhole of its rectified images")
-        weights = or_shipped(self.weights) if self.weights else resolve_weights("set", None, source.landmarks.features)
+        weights = resolve_weights("set", self.weights, source.landmarks.features)
         assert weights is not None
         if self.localize:
             from wheretolook.robot.export import export_localizer

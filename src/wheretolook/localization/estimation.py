@@ -476,7 +476,7 @@ class PoseAmbiguity:
         self.points = points
         self._tree = cKDTree(points[np.isfinite(points).all(axis=1)])
 
-    def unique_supports(self, rows: Sequence[NDArray[np.int64]], poses: Sequence[Float]) -> NDArray[np.int64]:
+    def unique_supports(self, rows: Sequence[NDArray[np.int64]], poses: Float | Sequence[Float]) -> NDArray[np.int64]:
         """Count voxels (K, K) with landmarks, rows (M_k,), that agree with each pose and that each other cannot explain.
 
         K poses (3, 4) are from the world into the same frame of camera or rig. A landmark within 0.4 m of a moved one is

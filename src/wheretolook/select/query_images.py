@@ -233,10 +233,9 @@ def cut_panorama(panorama: QueryImage) -> tuple[list[QueryImage], Float]:
     images = []
     for number, cam_from_rig in enumerate(CUBE_FACES):
         x, y, z = np.moveaxis(rays @ cam_from_rig, -1, 0)
-        columns = (np.arctan2(x, z) / (2 * np.pi) + 0.5) * width - 0.5
-        rows = (np.arcsin(y) / np.pi + 0.5) * height - 0.5
-        pixels = np.stack([columns, rows], axis=-1).astype(np.float32)
-        rgb = cv2.remap(panorama.rgb, pixels, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
+        columns = ((np.arctan2(x, z) / (2 * np.pi) + 0.5) * width - 0.5).astype(np.float32)
+        rows = ((np.arcsin(y) / np.pi + 0.5) * height - 0.5).astype(np.float32)
+        rgb = cv2.remap(panorama.rgb, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
         images.append(QueryImage(f"{panorama.name} {number}", np.asarray(rgb, np.uint8), camera))
     return images, np.pad(CUBE_FACES, ((0, 0), (0, 0), (0, 1)))
 

@@ -56,9 +56,8 @@ def rig_scores(scorers: Sequence[Scorer], cam_from_world: Float, scores: Float) 
     """Return the probabilities that at least one of N cameras localizes alone, and that all do jointly.
 
     Cameras that see the same landmarks fail together: in the order of their scores (N,), each counts by the share of its
-    expected detections that no camera before has in view, and a landmark is detected as often as by the best of them. The
-    log-odds of the joint pose are those of the best camera, plus what the others add to the set score. Poses are
-    (N, 3, 4) in the world.
+    expected detections that no camera before has in view, and for the set score a landmark is detected as often as by the
+    best of them. Poses are (N, 3, 4) in the world.
     """
     points = scorers[0].localization_map.landmarks.points
     p_detect = np.zeros((len(scorers), len(points)))
@@ -75,8 +74,6 @@ def rig_scores(scorers: Sequence[Scorer], cam_from_world: Float, scores: Float) 
     best = np.maximum.accumulate(p_detect)
     is_new = np.insert(best[:-1] == 0, 0, True, axis=0)
     share = (p_detect * is_new).sum(1) / np.maximum(p_detect.sum(1), 1e-9)
-    p_none = np.cumprod((1 - scores[order]) ** share)
-    joint = SetScoreModel.bundled()(best @ np.column_stack([np.ones(len(seen)), terms]), p_none)
-    odds = joint / (1 - joint)
-    together = scores.max() / (1 - scores.max()) * odds[-1] / odds[0]
-    return float(1 - p_none[-1]), float(together / (1 + together))
+    p_none = float(np.prod((1 - scores[order]) ** share))
+    sums = best[-1] @ np.column_stack([np.ones(len(seen)), terms])
+    return 1 - p_none, float(SetScoreModel.bundled()(sums, np.array(p_none)))

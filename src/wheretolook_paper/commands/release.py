@@ -79,7 +79,7 @@ class Release(Experiment):
 def _finish(options: Release, dataset: Dataset, log: Log, progress: Progress) -> Dataset:
     """Choose the weights that ship with a release, evaluate them, and write its card."""
     from wheretolook_paper.release import copy as releases
-    from wheretolook_paper.release.card import release_card
+    from wheretolook_paper.release.card import release_cards
     from wheretolook_paper.release.training_histories import keep_histories
 
     check_store(options.tracking)
@@ -99,8 +99,9 @@ def _finish(options: Release, dataset: Dataset, log: Log, progress: Progress) ->
     keep_histories(dataset, options.tracking)
     releases.sizes(dataset.root)  # an error if too large, before the evaluation
     on_cpu.run(log, progress)
-    write_text(dataset.root / releases.CARD, release_card(dataset, release_settings(Experiment())))
-    log(f"the card -> {dataset.root / releases.CARD}")
+    for path, card in release_cards(dataset, release_settings(Experiment())).items():
+        write_text(path, card)
+        log(f"the card -> {path}")
     log(releases.size_text(releases.sizes(dataset.root)))
     return dataset
 

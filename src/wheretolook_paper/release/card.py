@@ -1,4 +1,4 @@
-"""The card of a release in Markdown, `card.md.j2` filled in: contents, scores, training and fingerprints."""
+"""The cards of a release, of its data and of its weights, in Markdown with the header that the Hugging Face hub reads."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from wheretolook.utils.files import read_json_object, sha256
 from wheretolook.utils.texts import markdown_table
 from wheretolook.visibility.occlusion import StoredOcclusion
 from wheretolook_paper.evaluation.score_report import comparisons_markdown, score_markdown
-from wheretolook_paper.release.copy import read_about, size_text, sizes
+from wheretolook_paper.release.copy import CARD, read_about, size_text, sizes
 from wheretolook_paper.release.training_histories import records
 from wheretolook_paper.styles import PAPER_NETWORKS, method_style
 
@@ -34,13 +34,15 @@ GENERALIZATION_MD = "generalization.md"
 """In `results/`: scores on other datasets, as `scores.csv` with the columns `dataset` and `weights_sha256` (of the best
 weights at that time; rows of other weights are not shown), and a description of these datasets."""
 
-TEMPLATE = Path(__file__).with_name("card.md.j2")
+TAGS = ["visual-localization", "active-localization", "viewpoint-selection", "structure-from-motion", "robotics"]
 
 _LEARNER_METRICS = ("average_precision", "roc_auc", "bce")
 
 
-def release_card(release: Dataset, defaults: Mapping[str, Any]) -> str:
-    """Return the card; equal files give equal bytes. It shows the settings that differ from `defaults`, JSON values.
+def release_cards(release: Dataset, defaults: Mapping[str, Any]) -> dict[Path, str]:
+    """Return the card of the data and that of the weights by their files; equal files give equal bytes.
+
+    The first shows the settings that differ from `defaults`, JSON values.
 
     Raises:
         WeightsError: not exactly one of the paper's networks ships, or a record of training is missing.
@@ -48,17 +50,11 @@ def release_card(release: Dataset, defaults: Mapping[str, Any]) -> str:
         ConfigError: the description of the release is missing or damaged.
         StorageError: the release is too large.
     """
-    from jinja2 import Environment, StrictUndefined
-
-    environment = Environment(
-        undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True
-    )
-    environment.filters |= {"pairs": _pairs, "thousands": "{:,}".format}
     about = read_about(release)
     tables = {scene.name: scene.read_table() for scene in release.scenes}
     shares = label_shares(pooled_labels(tables, {scene.name: scene.split for scene in release.scenes}))
     changed = _difference(about["settings"], defaults)
-    text = environment.from_string(TEMPLATE.read_text(encoding="utf-8")).render(
+    contents: dict[str, Any] = dict(
         about=about,
         scenes=about["settings"]["scenes"],
         name=release.name,
@@ -75,7 +71,50 @@ def release_card(release: Dataset, defaults: Mapping[str, Any]) -> str:
         **_weights(release),
         **_scores(release, about["source"]),
     )
+    data = _data_header(release, about["source"], int(shares.iloc[-1]["n_views"]))
+    return {
+        release.root / CARD: data + _filled("card.md.j2", contents),
+        release.root / "weights" / CARD: _model_header(contents) + _filled("model_card.md.j2", contents),
+    }
+
+
+def _filled(template: str, contents: Mapping[str, Any]) -> str:
+    from jinja2 import Environment, StrictUndefined
+
+    environment = Environment(
+        undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True
+    )
+    environment.filters |= {"pairs": _pairs, "thousands": "{:,}".format}
+    text = environment.from_string(Path(__file__).with_name(template).read_text(encoding="utf-8")).render(contents)
     return re.sub(r"\n{3,}", "\n\n", text)
+
+
+def _data_header(release: Dataset, source: str, n_views: int) -> str:
+    """Return the hub's header of a dataset: its tables of viewpoints by split, under the hub's names."""
+    splits = []
+    for split, name in (("train", "train"), ("val", "validation"), ("test", "test")):
+        paths = [scene.table.relative_to(release.root).as_posix() for scene in release.split(split)]
+        if paths:
+            splits.append({"split": name, "path": paths})
+    magnitudes = ("n<1K", "1K<n<10K", "10K<n<100K", "100K<n<1M", "1M<n<10M")
+    size = magnitudes[sum(n_views >= 10**power for power in (3, 4, 5, 6))]
+    header = {"license": "apache-2.0", "pretty_name": f"wheretolook: {source}", "task_categories": ["robotics"]}
+    return _header(
+        header | {"size_categories": [size], "configs": [{"config_name": "viewpoints", "data_files": splits}]}
+    )
+
+
+def _model_header(contents: Mapping[str, Any]) -> str:
+    """Return the hub's header of a model, with the validation metrics of the weights that score by default."""
+    metrics = [{"type": name, "value": round(value, 4)} for name, value in contents["metrics"].items()]
+    dataset = {"name": f"{contents['validated_on']}, validation views", "type": "wheretolook"}
+    result = {"task": {"type": "robotics", "name": "whether a view localizes"}, "dataset": dataset, "metrics": metrics}
+    header = {"license": "apache-2.0", "library_name": "wheretolook", "pipeline_tag": "robotics"}
+    return _header(header | {"model-index": [{"name": contents["best"], "results": [result]}]})
+
+
+def _header(values: Mapping[str, Any]) -> str:
+    return f"---\n{yaml.safe_dump({**values, 'tags': TAGS}, sort_keys=False)}---\n\n"
 
 
 def _weight_files(release: Dataset) -> list[Path]:
@@ -102,6 +141,7 @@ def _scores(release: Dataset, source: str) -> dict[str, Any]:
     return {
         "scores": _score_table(scores, source),
         "variants": _score_table(variants, source),
+        "brief": _brief({source: scores, **{str(name): part for name, part in parts}}),
         "others": [_score_table(part.drop(columns="dataset"), str(name)) for name, part in parts],
         "others_about": description.read_text().strip("\n") if description.is_file() else "",
     }
@@ -121,6 +161,20 @@ def _score_table(scores: pd.DataFrame, dataset: str) -> str:
     parts = (markdown[:at], comparisons_markdown(scores), markdown[at:])
     joined = "\n\n".join(part.strip("\n") for part in parts if part.strip())
     return re.sub(r"^#", "###", joined, flags=re.MULTILINE)
+
+
+def _brief(scores: Mapping[str, pd.DataFrame]) -> str:
+    """Return a table of the methods' scores at the strictest thresholds over all scenes, by dataset."""
+    column = f"normalized_{threshold_key(THRESHOLDS[0])}"
+    rows = []
+    for dataset, table in scores.items():
+        of_all = table[(table["scene"] == ALL) & (table["candidates"] == "all") & (table["top_n"] == 1)]
+        of_all = of_all[of_all["occlusion"] == of_all["occlusion"].iloc[0]]
+        for _, row in of_all.iterrows():
+            rows.append(
+                [dataset, method_style(row["method"]).label, f"{100 * row[column]:.1f}", f"{row['roc_auc']:.3f}"]
+            )
+    return markdown_table(["dataset", "method", "localized, %", "AUC"], rows)
 
 
 def _label_table(release: Dataset, shares: pd.DataFrame) -> str:
@@ -170,6 +224,7 @@ def _weights(release: Dataset) -> dict[str, Any]:
         raise WeightsError(problem, path=release.root / "weights", value=networks, fix=fix)
     known = {path.stem: record for path, record in records(release.root / "weights").items()}
     network = known[networks[0]]
+    best = known[_best(release).stem]
     about = network["about"]
     alike = [network]
     for name, other in known.items():
@@ -187,7 +242,9 @@ def _weights(release: Dataset) -> dict[str, Any]:
         one["options"] = {name: value for name, value in one["config"].items() if name not in DECIDING}
     rows = [[one["label"], "yes" if one["ships"] else "no", str(one["dataset"])] for one in learners]
     return {
-        "best": known[_best(release).stem]["about"]["method"],
+        "best": best["about"]["method"],
+        "validated_on": str(best["about"]["dataset"]),
+        "metrics": {name: best["metrics"][f"val_{name}"] for name in ("average_precision", "roc_auc")},
         "network": about["method"],
         "label_of": lambda method: method_style(method).label,
         "files": [path.name for path in files.values()],

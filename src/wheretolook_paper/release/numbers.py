@@ -290,6 +290,21 @@ class Numbers:
         above = [interval_text(difference(views, "pairs", policy), "gain") for policy in ("random", "even")]
         return [*(f"{100 * row['strict']:.1f} / {100 * row['coarse']:.1f}" for row in shown), *above]
 
+    def panoramas(self, label: str) -> list[str]:
+        """Return shares right and counts of confident poses, right and confident, of panoramas and single cut-outs."""
+        table = self.table("panoramas.csv")
+        repeats = table["scene"].str.fullmatch(r"[a-z]+-\d+")
+        table = table[repeats if label == "two that repeat" else ~repeats]
+        right = (table["error_m"] <= 0.05) & (table["error_deg"] <= 0.4)
+        sure = table["probability"] >= 0.95
+        cells = [f"{(table['method'] == 'panorama').sum()}"]
+        for method in ("panorama", "best", "any"):
+            of_method = table["method"] == method
+            cells.append(f"{100 * right[of_method].mean():.1f}")
+            if method != "any":
+                cells.append(f"{(right & sure & of_method).sum()} of {(sure & of_method).sum()}")
+        return cells
+
     def looks(self, label: str) -> list[str]:
         rows = [self.row("looks.csv", split="test", strategy=LOOKS[label], n_looks=n) for n in (1, 2, 3, 5)]
         return [*(f"{100 * row['good']:.1f}" for row in rows), f"{100 * rows[-1]['any_good']:.1f}"]
@@ -349,6 +364,10 @@ def tables(numbers: Numbers) -> Mapping[tuple[str, str], Cells]:
             "docs/extend.md",
             "| photographs | none | a longer walk | random | even spread | lowest score | pairs | above random | above even |",
         ): numbers.extended_photographs,
+        (
+            "docs/rigs.md",
+            "| scenes | places | panorama | confident, right | most probable face | confident, right | any face |",
+        ): numbers.panoramas,
         (
             "docs/nav2.md",
             "| path, views | localized, % of the way | mean length, m | turning | pairs |",

@@ -22,6 +22,7 @@ from wheretolook.commands.sample import Sample
 from wheretolook.dataset.config import SampleConfig
 from wheretolook.dataset.scene import Scene
 from wheretolook.dataset.viewpoint_table import poses as poses_of_table
+from wheretolook.geometry.camera import ColmapCamera
 from wheretolook.geometry.poses import Float, camera_centers, compose_poses, pose_error, poses_looking_along
 from wheretolook.select.image_localizer import ImageLocalizer
 from wheretolook.select.localized import Localized
@@ -43,6 +44,7 @@ def record(result: Localized, pose: Float, seconds: float = np.nan) -> dict[str,
 def compare(localizer: ImageLocalizer, scene: Scene, pose: Float) -> dict[str, dict[str, float]]:
     """Return the records of a panorama rendered at a pose (3, 4), by method."""
     camera = localizer.images.known_camera("panorama")
+    assert isinstance(camera, ColmapCamera)
     rgb = scene.renderer.render(camera, pose[None]).rgb[0]
     start = time.monotonic()
     whole = record(localizer.localize(rgb, camera="panorama"), pose, time.monotonic() - start)

@@ -227,6 +227,11 @@ def steps(
             ],
             (SET,),
         ),
+        "panoramas": Step(
+            [study("panoramas", "--scenes", f"[building-700, office-701, {', '.join(f'{meshes / name}.glb' for name in SCENES)}]",
+                   "--out", str(RESULTS / "panoramas.csv"), "--device", device)],
+            needs="meshes",
+        ),
         "release": Step(
             [run("release", "", config="release")],
             (SET, MATCHABILITY, NETWORK, RESULTS / GENERALIZATION_CSV, RESULTS / GENERALIZATION_MD),

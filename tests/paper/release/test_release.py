@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+import yaml
 
 from all_options import AllOptions, run
 from fixed_fields import with_fields
@@ -25,13 +26,14 @@ from wheretolook.evaluation.config import EvaluateConfig
 from wheretolook.scorers.weights import load_scorer
 from wheretolook.tracking import TrackingConfig
 from wheretolook.training.data import load_views
+from wheretolook.training.weights import read_record
 from wheretolook.utils.errors import ConfigError, StorageError, WeightsError
 from wheretolook.utils.files import write_json
 from wheretolook.visibility.occlusion import StoredOcclusion
 from wheretolook_paper.commands.release import Release, release_settings
 from wheretolook_paper.evaluation.score_report import score_markdown
 from wheretolook_paper.release import copy as releases
-from wheretolook_paper.release.card import release_card
+from wheretolook_paper.release.card import release_cards
 from wheretolook_paper.release.copy import convert_to_float16
 
 pytestmark = pytest.mark.usefixtures("no_pictures")
@@ -64,8 +66,8 @@ def experiment_of(folder, name="tiny"):
     )  # fmt: skip
 
 
-def card_of(release):
-    return release_card(release, release_settings(AllOptions()))
+def card_of(release, folder="."):
+    return release_cards(release, release_settings(AllOptions()))[release.root / folder / releases.CARD]
 
 
 @pytest.fixture(scope="module")
@@ -215,8 +217,34 @@ def shipped():
     return Dataset.load(CONFIGS.parent / "data" / RELEASE)
 
 
+def header_of(path):
+    """Return the header of a card as the hub reads it: YAML between two lines of dashes at the beginning."""
+    before, header, text = path.read_text().split("---\n", 2)
+    assert before == "" and text.lstrip().startswith("# ")
+    return yaml.safe_load(header)
+
+
+def test_cards_have_the_headers_of_the_hub(shipped):
+    data = header_of(shipped.root / releases.CARD)
+    (config,) = data["configs"]
+    files = {part["split"]: part["path"] for part in config["data_files"]}
+    assert {*files} <= {"train", "validation", "test"}
+    assert files["test"] == [f"{scene.name}/viewpoints.parquet" for scene in shipped.split("test")]
+    assert all((shipped.root / path).is_file() for paths in files.values() for path in paths)
+    n_views = sum(len(pd.read_parquet(shipped.root / path)) for paths in files.values() for path in paths)
+    assert data["size_categories"] == ["100K<n<1M"] and 100_000 < n_views < 1_000_000
+    model = header_of(shipped.root / "weights" / releases.CARD)
+    (index,) = model["model-index"]
+    (result,) = index["results"]
+    metrics = read_record(shipped.root / "weights" / f"{index['name']}.safetensors")["metrics"]
+    for metric in result["metrics"]:
+        assert metric["value"] == pytest.approx(metrics[f"val_{metric['type']}"], abs=1e-4)
+    assert {data["license"], model["license"]} == {"apache-2.0"} and model["library_name"] == "wheretolook"
+
+
 def test_the_shipped_card_is_of_what_ships(shipped):
     assert (shipped.root / releases.CARD).read_text() == card_of(shipped)
+    assert (shipped.root / "weights" / releases.CARD).read_text() == card_of(shipped, "weights")
     options = {field.name for field in fields(AllOptions)}
     assert {*releases.read_about(shipped)["settings"]} == {*release_settings(AllOptions())} <= options
     assert sum(releases.sizes(shipped.root).values()) < releases.MAX_BYTES
@@ -242,7 +270,7 @@ def test_the_shipped_weights_score_as_the_card_says(shipped, tmp_path):
                      "--evaluate.occlusions", "[]"]
     )  # fmt: skip
     experiment = with_fields(experiment, {"evaluate.resamples": 2})
-    scores = run(Evaluate, experiment, log=quiet)
+    scores = experiment.run(quiet)
     said = pd.read_csv(shipped.root / "results" / "scores.csv")
     said = said[said["occlusion"] == "mesh"].merge(scores[["method"]].drop_duplicates()).reset_index(drop=True)
     # what is compared with the reference is another here: that of the card is not among the methods

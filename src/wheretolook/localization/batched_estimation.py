@@ -103,7 +103,8 @@ class MatchBatch:
         shifts = turns[..., 0].contiguous()
         stream = wp.stream_from_torch(costs.device) if costs.is_cuda else None
         keypoints = pad(self.keypoints[:, 0], (0, 1), value=1.0)
-        inputs = [self.points[:, 0], keypoints, wp.vec3d(*self.focal.tolist(), 0), counts, drawn]
+        focal_x, focal_y = self.focal.tolist()
+        inputs = [self.points[:, 0], keypoints, wp.vec3d(focal_x, focal_y, 0.0), counts, drawn]
         wp.launch(p3p_kernel, drawn.shape[:2], [*inputs, costs, turns, shifts], device=str(costs.device), stream=stream)
         few = costs.flatten(1).topk(16, largest=False).indices[..., None, None]
         poses = torch.cat([turns, shifts[..., None]], -1).flatten(1, 2)

@@ -125,8 +125,8 @@ class _SceneInProgress:
         }
         if job.localizer.method == "hypotheses":
             settings["first"] = True  # shards of before lack these labels
-        if device != "cpu":
-            settings["poses"] = "batched"  # `BatchedEstimator`
+            if device != "cpu":
+                settings["poses"] = "batched"  # `BatchedEstimator`
         if job.changed_mesh:
             settings["changed_mesh"] = fingerprint(job.changed_mesh)
         if job.cameras:

@@ -37,11 +37,12 @@ def read_rig(source: str | Path, opened: Map) -> list[RigCamera]:
     if str(source).isdecimal():
         assert opened.path is not None
         rigs = read_model(opened.path).rigs
-        check_choice("rig_id", int(source), rigs)
-        rig = rigs[int(source)]
+        number = int(str(source))
+        check_choice("rig_id", number, rigs)
+        rig = rigs[number]
         others = {sensor.id: pose.matrix() for sensor, pose in rig.non_ref_sensors.items()}
         poses = {rig.ref_sensor_id.id: np.eye(3, 4), **others}
-        return [RigCamera(str(number), opened.cameras[number], pose) for number, pose in poses.items()]
+        return [RigCamera(str(camera_id), opened.cameras[camera_id], pose) for camera_id, pose in poses.items()]
     try:
         return [
             RigCamera(str(name), read_camera(row["camera"]), poses_of_values(row["cam_from_rig"]))

@@ -57,7 +57,7 @@ class DevicePoints:
         return wp.array(np.argsort(self.order).astype(np.int32), dtype=wp.int32, device=self.device)
 
 
-def morton_codes(positions: NDArray[np.float64]) -> NDArray[np.int64]:
+def morton_codes(positions: Float) -> NDArray[np.int64]:
     """Place (N,) of points (N, 3) along a Morton curve through their bounding box; points not finite come first."""
     finite = np.isfinite(positions).all(1)
     codes = np.zeros(len(positions), dtype=np.int64)

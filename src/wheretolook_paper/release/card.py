@@ -10,7 +10,7 @@ from typing import Any
 import pandas as pd
 import yaml
 
-from wheretolook.dataset.config import ALL, THRESHOLDS, threshold_key, threshold_label
+from wheretolook.dataset.config import ALL, THRESHOLDS, Split, threshold_key, threshold_label
 from wheretolook.dataset.layout import Dataset
 from wheretolook.dataset.viewpoint_table import POSITIVE, label_shares, pooled_labels
 from wheretolook.evaluation.config import SCORES_CSV, VARIANTS_CSV
@@ -92,7 +92,8 @@ def _filled(template: str, contents: Mapping[str, Any]) -> str:
 def _data_header(release: Dataset, source: str, n_views: int) -> str:
     """Return the hub's header of a dataset: its tables of viewpoints by split, under the hub's names."""
     splits = []
-    for split, name in (("train", "train"), ("val", "validation"), ("test", "test")):
+    names: dict[Split, str] = {"train": "train", "val": "validation", "test": "test"}
+    for split, name in names.items():
         paths = [scene.table.relative_to(release.root).as_posix() for scene in release.split(split)]
         if paths:
             splits.append({"split": name, "path": paths})

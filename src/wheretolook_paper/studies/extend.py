@@ -170,7 +170,7 @@ def _try(trial: _Trial) -> float:
 
 def row_of(plan: dict[str, Any], errors: Float, registered: list[Float]) -> dict[str, Any]:
     """Return columns of the table for errors (T, 2) of target views, and (2,) of each photograph that is added."""
-    strict = (errors <= STRICT).all(axis=1)
+    strict = np.asarray((errors <= STRICT).all(axis=1))
     return {
         "views": len(strict),
         "strict": strict.mean(),
@@ -240,7 +240,7 @@ class Study:
 
     def chosen(self, policy: str, planner: Planner | None, least_p: float, workers: int, trials: int) -> dict[str, Any]:
         """Return the images of a policy's map, with what was predicted of them; kept in a file."""
-        plan = {"poses": self.walk, "predicted": np.nan, "p_registers": np.empty(0), "seconds": 0.0}
+        plan: dict[str, Any] = {"poses": self.walk, "predicted": np.nan, "p_registers": np.empty(0), "seconds": 0.0}
         if policy == "walk":
             return plan | {"poses": self.walks[self.images + self.n]}
         file = self.plan_file(policy)

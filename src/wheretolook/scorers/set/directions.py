@@ -170,8 +170,9 @@ class BatchedDirections:
         described.layers = empty(number, 6 * width)
         described.terms = empty(number, dtype=directions_kernel.Sums)
         wp.launch(self._describe, number, [self.network, nearby.offsets, nearby.rows], [described], device=device)
-        numbers = (listed.n_visible, listed.starts, listed.lengths)
-        visible, starts, lengths = (wp.array(values, device=device) for values in numbers)
+        numbers: Any = (listed.n_visible, listed.starts, listed.lengths)
+        uploaded: list[Any] = [wp.array(values, device=device) for values in numbers]
+        visible, starts, lengths = uploaded
         none: Any = wp.ones((len(views), CELLS**2), dtype=wp.float32, device=device)
         sums, cells = empty(len(views), dtype=directions_kernel.Sums), empty(len(views))
         inputs = [self.network, described, starts, lengths, listed.entries, listed.image, visible, self._edges, none]

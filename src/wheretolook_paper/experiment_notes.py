@@ -113,6 +113,13 @@ Planned paths whose views were rendered and localized. Open the run (+) to compa
 - `times_forward`: this share divided by that of looking forward; `times_forward_length`: the path's length likewise""",
         {"methods": View("all methods, the best first", "localized", _PATHS, "params.method LIKE '%'", False)},
     ),
+    "extend": Purpose(
+        """\
+Maps of renders that photographs extend, a run for each policy within one (open it, +).
+
+- `strict`, `coarse`: share of target views within 5 cm and 0.4°, 25 cm and 2°; **sort by the first, highest first**
+- `gain`: points of `strict` over the present map; `won`, `lost`: views that only the extended or present map localizes"""
+    ),
     "plan": Purpose(
         "Single paths. Compare `score`, the mean score of the views, and `length_m`; picture and film are artifacts."
     ),

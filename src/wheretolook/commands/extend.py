@@ -34,6 +34,7 @@ class Extend(TargetOptions, SelectorOptions):
 
     Examples:
       wheretolook extend --map sparse/0 --mesh house.glb --n 10 --out photographs.csv --floor-plan photographs.png
+      wheretolook view --map sparse/0 --mesh house.glb --path photographs.csv
       wheretolook extend --map sparse/0 --scale 1 --n 20 --until 0.9 --out photographs.tum
       wheretolook extend --map sparse/0 --mesh house.glb --targets path.tum --height 0.4 --pitch 0 20 --out images.txt
 

@@ -14,13 +14,21 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping
-from functools import cache
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
 
 from wheretolook_paper.evaluation.comparison import interval_text
+from wheretolook_paper.evaluation.extend import (
+    EXTEND_CSV,
+    PHOTOGRAPHS_CSV,
+    difference,
+    outcomes,
+    policies,
+    registrations,
+)
 
 STRICT = "0.05m_0.4deg"
 
@@ -72,6 +80,18 @@ POLICIES = {
     "score at the true pose": "known",
 }
 
+
+EXTENSIONS = {
+    "none": "none",
+    "random": "random",
+    "even spread": "even",
+    "lowest score, apart": "worst",
+    "a longer walk": "walk",
+    "pairs, by landmarks": "pairs-landmarks",
+    "pairs, by depth images": "pairs-depth",
+    "pairs, by the mesh": "pairs",
+}
+"""Policies of extending a map by their names in tables."""
 
 PATHS = "| two test apartments | six other scenes | all | × forward | length / forward's | turning | no path |"
 
@@ -231,6 +251,45 @@ class Numbers:
         sure = (f"{table[f'sure_right{kind}'].sum()} of {table[f'sure{kind}'].sum()}" for kind in ("", "_without"))
         return [*(f"{means[name]:.3f}" for name in columns), *sure]
 
+    # --- photographs that extend maps
+
+    @cached_property
+    def _extended(self) -> Any:
+        """Outcomes of views by policy, of maps of scenes; and the rows of the table by policy."""
+        return outcomes(self.table(EXTEND_CSV)), policies(self.table(EXTEND_CSV)).set_index("policy")
+
+    def extended(self, label: str) -> list[str]:
+        views, rows = self._extended
+        policy = EXTENSIONS[label]
+        row = rows.loc[policy]
+        cells = [f"{100 * row['strict']:.1f}", f"{100 * row['coarse']:.1f}"]
+        if policy != "none":
+            cells += [interval_text(row, "gain"), f"{row['won']:.0f} / {row['lost']:.0f}"]
+        if policy not in ("none", "pairs"):
+            cells.append(interval_text(difference(views, "pairs", policy), "gain"))
+        return [*cells, "", "", ""][:5]
+
+    def extended_scene(self, label: str) -> list[str]:
+        """Return shares of a scene without and with planned photographs, predicted too, and views gained and lost."""
+        name = label.replace(" ", "-") if label.startswith("apartment") else label
+        table = self.table(EXTEND_CSV)
+        views, _ = self._extended
+        of_scene = table[table["scene"] == name].groupby("policy")[["strict", "predicted"]].mean()
+        counts = difference(views.loc[[name]], "pairs", "none")
+        shares = [of_scene.loc[policy, column] for column in ("strict", "predicted") for policy in ("none", "pairs")]
+        cells = [f"{100 * share:.0f}" for share in shares]
+        return [cells[0], cells[1], f"{counts['won']} / {counts['lost']}", cells[2], cells[3]]
+
+    def extended_photographs(self, label: str) -> list[str]:
+        name = label.partition(",")[0]
+        table = self.table(PHOTOGRAPHS_CSV)
+        table = table[table["scene"] == name]
+        views = outcomes(table)
+        rows = policies(table).set_index("policy")
+        shown = [rows.loc[policy] for policy in ("none", "walk", "random", "even", "worst", "pairs")]
+        above = [interval_text(difference(views, "pairs", policy), "gain") for policy in ("random", "even")]
+        return [*(f"{100 * row['strict']:.1f} / {100 * row['coarse']:.1f}" for row in shown), *above]
+
     def panoramas(self, label: str) -> list[str]:
         """Return shares right and counts of confident poses, right and confident, of panoramas and single cut-outs."""
         table = self.table("panoramas.csv")
@@ -294,6 +353,18 @@ def tables(numbers: Numbers) -> Mapping[tuple[str, str], Cells]:
             "| without the factor |",
         ): numbers.confidence,
         (
+            "docs/extend.md",
+            "| ten photographs more | within 5 cm, 0.4° | within 25 cm, 2° | gain | views gained / lost | pairs above it |",
+        ): numbers.extended,
+        (
+            "docs/extend.md",
+            "| scene | none | pairs | views gained / lost | predicted: none | predicted: pairs |",
+        ): numbers.extended_scene,
+        (
+            "docs/extend.md",
+            "| photographs | none | a longer walk | random | even spread | lowest score | pairs | above random | above even |",
+        ): numbers.extended_photographs,
+        (
             "docs/rigs.md",
             "| scenes | places | panorama | confident, right | most probable face | confident, right | any face |",
         ): numbers.panoramas,
@@ -344,9 +415,24 @@ def prose(numbers: Numbers) -> Mapping[tuple[str, str], list[str]]:
     _, n_views, _ = numbers.labelled("all")
     n_locations, _, share = numbers.labelled("test")
     interiors = numbers.scores(other, "random")  # its share is that of all views, as many at each location
+    planned = numbers.table(EXTEND_CSV)
+    registered = registrations(planned[planned["policy"] == "pairs"])
+    likely = registered[registered["p"] >= 0.3]
+    of_policy = {name: rows.set_index(["scene", "seed"]) for name, rows in planned.groupby("policy")}
+    greedy = of_policy["oracle"].index
+    oracle = [f"{100 * of_policy[name].loc[greedy, 'strict'].mean():.0f}" for name in ("none", "pairs", "oracle")]
     number = r"(-?[+\d.]+)"
     pair = rf"{number} points on the apartments \[{number}, {number}\] and {number} on the six scenes"
     return {
+        ("docs/extend.md", r"Of (\d+) photographs with a probability of at least 0.3, (\d+) % register"): [
+            f"{len(likely)}",
+            f"{100 * likely['registered'].mean():.0f}",
+        ],
+        ("docs/extend.md", r"mean probability of all (\d+) is ([\d.]+), and ([\d.]+) of them register"): [
+            f"{len(registered)}",
+            *(f"{registered[name].mean():.2f}" for name in ("p", "registered")),
+        ],
+        ("docs/extend.md", r"from (\d+) to (\d+) %, where greedy choices by real maps reach (\d+) %"): oracle,
         ("README.md", r"([\d,]+) labelled viewpoints ship"): [n_views],
         ("docs/results.md", r"contains ([\d,]+) labelled viewpoints"): [n_views],
         ("docs/results.md", r"Two test apartments\*\* .* (\d+) locations .* (\d+) % localize"): [n_locations, share],

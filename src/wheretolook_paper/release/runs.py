@@ -43,6 +43,7 @@ from wheretolook.training.provenance import HISTORY_CSV, kept_metrics, params_of
 from wheretolook.utils.files import copy_file, temporary_folder, write_text
 from wheretolook.utils.processes import hold
 from wheretolook_paper.evaluation.comparison import log_comparison
+from wheretolook_paper.evaluation.extend import EXTEND_CSV, log_extend
 from wheretolook_paper.evaluation.looks import LOOKS_CSV, log_looks
 from wheretolook_paper.figures.runtimes import runtime_figure, scaling_figure
 from wheretolook_paper.paths.path_report import PATHS_CSV, log_paths
@@ -248,6 +249,10 @@ def _log_looks(dataset: Dataset, tracking: TrackingConfig) -> str:
     return log_looks(tracking, table[table["split"] == "test"], params, [file], TAGS)
 
 
+def _log_extend(dataset: Dataset, tracking: TrackingConfig) -> str:
+    return log_extend(tracking, dataset.name, dataset.root / "results", TAGS)
+
+
 def _log_benchmark(dataset: Dataset, tracking: TrackingConfig) -> str:
     return log_runtimes(tracking, dataset.root / "results", TAGS)
 
@@ -257,6 +262,7 @@ _LOGGED: dict[str, tuple[str, Callable[..., str]]] = {
     "learners": (LEARNERS_CSV, _log_learners),
     "paths": (PATHS_CSV, _log_paths),
     "looks": (LOOKS_CSV, _log_looks),
+    "extend": (EXTEND_CSV, _log_extend),
     "benchmark": (RUNTIMES_CSV, _log_benchmark),
 }
 """File in `results/` of each stage, and the function that logs it."""

@@ -30,6 +30,7 @@ from wheretolook.utils.errors import ConfigError
 from wheretolook.utils.files import copy_file, read_json_object, sha256, write_json, write_text
 from wheretolook.utils.package import VERSION
 from wheretolook_paper.evaluation.comparison import replace_rows
+from wheretolook_paper.evaluation.extend import EXTEND_CSV, PHOTOGRAPHS_CSV
 from wheretolook_paper.evaluation.looks import LOOKS_CSV
 from wheretolook_paper.paths.path_report import PATHS_CSV, pooled_paths
 from wheretolook_paper.release.card import GENERALIZATION_CSV, GENERALIZATION_MD
@@ -95,6 +96,18 @@ def steps(
     def study(name: str, *options: str) -> Words:
         return (f"wheretolook_paper.studies.{name}", *options)
 
+    # rows of the table are resumed, which other weights would not make
+    extensions = f"data/extend-{sha256(SET)[:8] if SET.is_file() else ''}"
+
+    def extended(scene: str, seed: int) -> Words:
+        # fusing the depth images of a game level takes minutes
+        more = () if scene.startswith("nexuiz") else ("pairs-landmarks", "pairs-depth")
+        policies = ", ".join(("none", "random", "even", "worst", "walk", "pairs", *more))
+        return study(
+            "extend", "--mesh", f"data/test-90/{scene}/mesh.glb", "--seed", str(seed), "--policies", f"[{policies}]",
+            "--work", extensions, "--out", f"{extensions}/{EXTEND_CSV}"
+        )  # fmt: skip
+
     def checked(name: str, kind: str, folder: str, *options: str) -> Words:
         return study("photographs", kind, str(photographs / folder), "--work", f"data/photographs/{name}", *options)
 
@@ -154,6 +167,24 @@ def steps(
             )
             for scene in ("apartment-210", "apartment-211", *SCENES)
         },
+        "extend": Step(
+            [
+                run("scenes", "test-90", *CAMERAS["test-90"], *others),
+                *(extended(scene, seed) for scene in ("apartment-210", "apartment-211", *SCENES) for seed in range(3)),
+                (*extended("apartment-210", 0), "--policies", "[oracle]", "--trials", "6"),
+            ],
+            (SET,),
+            lambda: _copy(f"{extensions}/{EXTEND_CSV}".removeprefix("data/")),
+            "meshes",
+        ),
+        "extend-photographs": Step(
+            [study("extend_photographs", "--map", f"data/photographs/{name}/map", "--name", name, "--features",
+                   f"data/photographs/{name}/photographs/database.db", "--work", extensions, "--images", images,
+                   "--n", n, "--out", str(RESULTS / PHOTOGRAPHS_CSV))
+             for name, images, n in (("kitchen", "30", "10"), ("fox", "8", "4"))],
+            (SET,),
+            needs="photographs",
+        ),
         **{
             f"nav2-{scene}": Step(
                 [

@@ -44,8 +44,9 @@ def children(tracking, parent):
 
 def test_every_kind_of_result_becomes_a_run_once(logged):
     release, tracking, runs = logged
-    names = {"evaluate", "learners", "paths", "looks", "benchmark", "evaluate interiors", "train mlp-2d+3d"}
-    assert runs.ids.keys() == names and len({*runs.ids.values()}) == runs.new == 7
+    names = {"evaluate", "learners", "paths", "looks", "extend", "benchmark"}
+    names |= {"evaluate interiors", "train mlp-2d+3d"}
+    assert runs.ids.keys() == names and len({*runs.ids.values()}) == runs.new == 8
     assert log_release(release, tracking) == dataclasses.replace(runs, new=0)
     scores = read_scores(release.root / "results" / "scores.csv")
     pd.testing.assert_frame_equal(latest_scores(tracking, "release"), scores)
@@ -63,6 +64,8 @@ def test_every_kind_of_result_becomes_a_run_once(logged):
     }
     looks = children(tracking, runs.ids["looks"])
     assert looks["together, 2 looks (looks release)"][1] == {"good": 0.8, "any_good": 0.75}
+    pairs = children(tracking, runs.ids["extend"])["pairs (extend release)"][1]
+    assert pairs["gain"] == pytest.approx(0.2) and (pairs["won"], pairs["lost"], pairs["views"]) == (6, 2, 20)
 
 
 def test_a_release_is_logged_as_its_evaluation_was(tmp_path):

@@ -50,8 +50,8 @@ class Surface:
     def patches(self, cam_from_world: Float, across: int, down: int) -> Patches:
         """Return the surface in the cells, so many across and down the image, of views (V, 3, 4) of the map's camera.
 
-        It is where a ray through the middle of a cell meets the mesh. Else it is the landmark of the longest track in the
-        cell, or, where there is none, assumed at the median distance of landmarks: what no image has shown yet.
+        It is where a ray through the middle of a cell meets the mesh, or without either the landmark of the longest track
+        in the cell. Where depth images or landmarks show none, it is assumed at the median distance of landmarks.
         """
         camera = self.localization_map.camera
         centers = camera_centers(cam_from_world)
@@ -61,16 +61,18 @@ class Surface:
         axes = (rays[cells] @ cam_from_world[:, :, :3]).reshape(-1, 3)
         view = np.repeat(np.arange(len(centers)), len(cells))
         landmark = np.full(len(view), -1)
-        if self.raycaster is None:
-            landmarks = self.localization_map.landmarks
-            landmark = self._landmark_of_cells(cam_from_world, across, down)[:, cells].ravel()
-            points = centers[view] + axes * np.median(landmarks.mapping_distance_m)
-            points[landmark >= 0] = landmarks.points[landmark[landmark >= 0]]
-        else:
+        landmarks = self.localization_map.landmarks
+        distance = np.full(len(view), np.inf)
+        if self.raycaster is not None:
             distance = self.raycaster.cast(centers[view], axes).distance_m
+        if self.name == "mesh":
             hit = np.isfinite(distance)
-            view, landmark = view[hit], landmark[hit]
-            points = centers[view] + axes[hit] * distance[hit, None]
+            view, landmark, axes, distance = view[hit], landmark[hit], axes[hit], distance[hit]
+        distance = np.where(np.isfinite(distance), distance, np.median(landmarks.mapping_distance_m))
+        points = centers[view] + axes * distance[:, None]
+        if self.raycaster is None:
+            landmark = self._landmark_of_cells(cam_from_world, across, down)[:, cells].ravel()
+            points[landmark >= 0] = landmarks.points[landmark[landmark >= 0]]
         lines = points - centers[view]
         return Patches(len(centers), across * down, view, points, unit(lines), np.linalg.norm(lines, axis=1), landmark)
 

@@ -243,9 +243,10 @@ class Numbers:
         return [f"{100 * row['right_1']:.1f}", *joint, *stopped, confident]
 
     def confidence(self, label: str) -> list[str]:
-        """Return what is right and predicted of poses on maps of photographs, in the mean over maps, with and without factor."""
+        """Return what is right and predicted of poses on maps of photographs, in the mean over places, with and without factor."""
         table = self.table("confidence.csv")
-        table = table[table["accuracy_m"] == float(label.split()[0]) / 100]
+        # of the kitchen, its whole map counts
+        table = table[(table["accuracy_m"] == float(label.split()[0]) / 100) & ~table["map"].str.contains("_")]
         means = table.select_dtypes("number").mean()
         columns = ("right", "predicted", "loss", "predicted_without", "loss_without")
         sure = (f"{table[f'sure_right{kind}'].sum()} of {table[f'sure{kind}'].sum()}" for kind in ("", "_without"))

@@ -77,7 +77,7 @@ def _camera(given: Mapping[str, Any]) -> Camera:
         # pixel (0, 0) of ROS and OpenCV is the centre of the top-left pixel
         pinhole = matrix[0], matrix[4], matrix[2] + 0.5, matrix[5] + 0.5
     if float(width).is_integer() and float(height).is_integer():
-        width, height = int(width), int(height)
+        width, height = map(int, (width, height))
     for name, n in (
         (("OPENCV_FISHEYE", 4),) if model in FISHEYE else (("PINHOLE", 0), ("OPENCV", 4), ("FULL_OPENCV", 8))
     ):

@@ -63,8 +63,8 @@ def _rig_of_file(path: Path) -> list[RigCamera]:
     cameras = []
     try:
         for name, row in read_yaml(path).items():
-            beside = os.path.join(path.parent, row["camera"])
-            camera = read_camera(beside if os.path.isfile(beside) else row["camera"])
+            relative = os.path.join(path.parent, row["camera"])
+            camera = read_camera(relative if os.path.isfile(relative) else row["camera"])
             cameras.append(RigCamera(str(name), camera, poses_of_values(row["cam_from_rig"])))
     except (OSError, ValueError, LookupError, TypeError, AttributeError, ConfigError) as error:
         fix = "A line is: name: {camera: 'MODEL,width,height,parameters', cam_from_rig: [qw, qx, qy, qz, tx, ty, tz]}."

@@ -237,6 +237,9 @@ class ImageLocalizer:
         known = camera if isinstance(camera, Mapping) else self.images.known_camera(camera)
         names = names or distinct_names([Path(path) for path in paths])
         queries = [self.images.read(image, name, known) for image, name in zip(given, names, strict=True)]
+        if len(queries) > 1 and any(is_panorama(query.camera) for query in queries):
+            fix = "Localize each alone, without turns."
+            raise ConfigError("several panoramas are not localized together", value=names, fix=fix)
         near = None if prior is None else PosePrior.of(prior, self.frame.world_from_map)
         limits = checked_accuracy(accuracy, self.landmarks.mapping_distance_m)
         exact = self._localizer.joint  # rotations

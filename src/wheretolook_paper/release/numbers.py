@@ -294,8 +294,8 @@ class Numbers:
     def panoramas(self, label: str) -> list[str]:
         """Return shares right and counts of confident poses, right and confident, of panoramas and single cut-outs."""
         table = self.table("panoramas.csv")
-        repeats = table["scene"].str.fullmatch(r"[a-z]+-\d+")
-        table = table[repeats if label == "two that repeat" else ~repeats]
+        named = table["scene"] == label
+        table = table[named if named.any() else ~table["scene"].str.fullmatch(r"[a-z]+-\d+")]
         right = (table["error_m"] <= 0.05) & (table["error_deg"] <= 0.4)
         sure = table["probability"] >= 0.95
         cells = [f"{(table['method'] == 'panorama').sum()}"]

@@ -1,6 +1,7 @@
 """Cameras in files of ROS, OpenCV and nerfstudio, compared with the camera and with OpenCV's rays."""
 
 import json
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -51,7 +52,7 @@ def calibration(path, name, distortion):
     )
 
 
-def echo(path, name, distortion, k=K, names="dk", more=""):
+def echo(path, name, distortion, k=K, names="dk", more="", binning=0):
     """Write what `ros2 topic echo` prints of two messages; K and D as ROS 1 does if `names` are upper case."""
     model = name.partition(",")[0]
     d, k_name = names
@@ -59,7 +60,7 @@ def echo(path, name, distortion, k=K, names="dk", more=""):
     for key, values in ((d, distortion), (k_name, np.ravel(k).tolist()), ("p", [0.0] * 12)):
         lists += f"{key}:\n" + "".join(f"- {value!r}\n" for value in values) if values else f"{key}: []\n"
     head = "header:\n  stamp:\n    sec: 1\n    nanosec: 2\n  frame_id: camera\n"
-    message = f"{head}height: 480\nwidth: 640\ndistortion_model: {model}\n{lists}binning_x: 0\nbinning_y: 0\n"
+    message = f"{head}height: 480\nwidth: 640\ndistortion_model: {model}\n{lists}binning_x: 0\nbinning_y: {binning}\n"
     roi = "roi:\n  x_offset: 0\n  y_offset: 0\n  height: 0\n  width: 0\n  do_rectify: false\n"
     path.write_text(f"{message}{more or roi}---\n{message}{roi}---\n")
 
@@ -95,11 +96,22 @@ def test_rays_are_those_of_the_camera_and_of_opencv(write, name, tmp_path):
         ({"fl_x": 500, "k1": 0.1, "k3": 0.01}, "FULL_OPENCV", (500, 500, 320, 240, 0.1, 0, 0, 0, 0.01, 0, 0, 0)),
         ({"fl_x": 300, "camera_model": "OPENCV_FISHEYE", "k1": 0.01, "k4": 1e-4}, "OPENCV_FISHEYE",
          (300, 300, 320, 240, 0.01, 0, 0, 1e-4)),
+        ({"fl_x": 300, "is_fisheye": True, "k1": 0.01}, "OPENCV_FISHEYE", (300, 300, 320, 240, 0.01, 0, 0, 0)),
+        ({"fl_x": 500, "w": 640.0, "h": 480.0, "is_fisheye": False}, "PINHOLE", (500, 500, 320, 240)),
     ],
 )  # fmt: skip
 def test_transforms_of_nerfstudio(given, model, params, tmp_path):
-    (tmp_path / "transforms.json").write_text(json.dumps({"w": 640, "h": 480, "frames": [], **given}))
+    (tmp_path / "transforms.json").write_text("\n " + json.dumps({"w": 640, "h": 480, "frames": [], **given}))
     assert read_camera(str(tmp_path / "transforms.json")) == camera_of(model, *SIZE, params)
+
+
+@pytest.mark.parametrize(
+    "more", ["", "roi:\n", "distortion_coefficients:\nroi: {height: 480, width: 640}\nbinning_x: 1\n"]
+)
+def test_without_distortion_and_region_the_camera_is_a_pinhole(more, tmp_path):
+    matrix = f"camera_matrix: {{data: {K.ravel().tolist()}}}"
+    (tmp_path / "camera.yaml").write_text(f"image_width: 640\nimage_height: 480\n{matrix}\n{more}")
+    assert read_camera(str(tmp_path / "camera.yaml")) == camera_of("PINHOLE", *SIZE, PINHOLE)
 
 
 def broken(path, **given):
@@ -114,11 +126,15 @@ def broken(path, **given):
         (lambda path: broken(path, model="magic"), "distortion model"),
         (lambda path: broken(path, distortion=[0.1] * 14), "COLMAP has no model"),
         (lambda path: broken(path, more="roi:\n  width: 320\n"), "region of interest"),
-        (lambda path: path.write_text("width: 640\nheight: 480\n"), "describes no camera"),
+        (lambda path: broken(path, more="roi:\n  height: 320\n  width: 640\n"), "region of interest"),
+        (lambda path: broken(path, more="roi:\n---\n", binning=2), "binning"),
+        (lambda path: broken(path, k=np.ones((2, 2))), "9 numbers, not 4"),
+        (lambda path: path.write_text("width: 640\nheight: 480\n"), "'camera_matrix' is missing"),
+        (lambda path: path.write_text("width: 640\n"), "'image_height' is missing"),
         (lambda path: path.write_text("a list of things"), "describes no camera"),
-        (lambda path: path.write_text(""), "describes no camera"),
+        (lambda path: path.write_text(""), "no names with values"),
         (lambda path: path.write_bytes(b"\xff\xfe"), "describes no camera"),
-        (lambda path: path.write_text('{"w": 640, "h": 480, "frames": []}'), "describes no camera"),
+        (lambda path: path.write_text('{"w": 640, "h": 480, "frames": [{"fl_x": 9}]}'), "above frames"),
         (lambda path: path.write_text('{"w": 640, "h": 480, "fl_x": 500, "k4": 1}'), "COLMAP has no model"),
         (
             lambda path: path.write_text('{"w": 640, "h": 480, "fl_x": 500, "camera_model": "EQUIRECTANGULAR"}'),
@@ -134,6 +150,12 @@ def test_what_is_no_camera_is_named_with_the_file(write, problem, tmp_path):
     assert raised.value.path == tmp_path / "camera.yaml"
 
 
+@pytest.mark.parametrize(("text", "problem"), [("missing.YAML", "no such file"), ("PINHOLE,640,480" * 99, "no camera")])
+def test_texts_that_are_neither_a_camera_nor_a_file(text, problem):
+    with pytest.raises(ConfigError, match=problem):
+        read_camera(text)
+
+
 def test_commands_and_python_take_the_file(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     sparse = write_room(tmp_path / "sparse")
@@ -142,4 +164,8 @@ def test_commands_and_python_take_the_file(tmp_path, monkeypatch):
     assert main(["select", *given, "--at", "2,2,1.5", "--out", "views.json"]) == 0
     assert json.loads((tmp_path / "views.json").read_text())["camera"]["params"] == list(PINHOLE)
     images = QueryImages(Map.open(sparse))
-    assert images.known_camera("camera_info.yaml") == read_camera("camera_info.yaml")
+    expected = read_camera("camera_info.yaml")
+    (tmp_path / "list.yaml").write_text(f"# of images\na.jpg PINHOLE 640 480 {' '.join(map(str, PINHOLE))}\n")
+    (tmp_path / "camera_info.yaml").rename("camera")
+    assert images.known_camera("camera") == images.known_camera(Path("camera")) == expected
+    assert images.known_camera("list.yaml") == {"a.jpg": expected}

@@ -421,6 +421,8 @@ def test_what_is_no_panorama_is_refused_with_the_fix(room, photos, localizer):
     folder = str(room.landmarks.parent)
     with pytest.raises(ConfigError, match=r"320 x 240 px is no equirectangular panorama.*twice as wide as high"):
         localizer.localize(photos / "a.png", camera="panorama")
+    with pytest.raises(ConfigError, match="several panoramas"):
+        localizer.localize([np.zeros((360, 720, 3), np.uint8)] * 2, np.tile(np.eye(3), (2, 1, 1)), camera="panorama")
     with pytest.raises(ConfigError, match="either --images or --panorama"):
         Localize(map=folder)
     with pytest.raises(ConfigError, match="leave --turns"):

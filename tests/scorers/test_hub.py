@@ -38,8 +38,16 @@ def test_a_name_is_found_in_the_cache(cache, tmp_path):
     assert again.score == poses.score
 
 
-@pytest.mark.parametrize("name", ["lab/nothing", "nobody/nothing"])
+def test_the_cache_may_be_elsewhere(cache, tmp_path, monkeypatch):
+    monkeypatch.setenv("HF_HUB_CACHE", str(tmp_path / "home" / "hub"))
+    monkeypatch.setenv("HF_HOME", str(tmp_path / "other"))
+    assert resolve_weights(path="lab/where-to.look") == cache / "set.safetensors"
+
+
+@pytest.mark.parametrize("name", ["lab/nothing", "nobody/nothing", "lab/where-to.look"])
 def test_what_is_neither_here_nor_on_the_hub(cache, name):
+    for path in cache.glob("*.safetensors"):  # such as after a download of the card alone
+        path.unlink()
     with pytest.raises(WeightsError, match="not on the hub"):
         resolve_weights(path=name)
 

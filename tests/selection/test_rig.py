@@ -14,6 +14,8 @@ from wheretolook.cli import main
 from wheretolook.geometry.pose_files import tum_text
 from wheretolook.geometry.poses import compose_poses, poses_looking_along
 from wheretolook.looks.selection import SetScoreModel, candidate_views, score_of_set
+from wheretolook.mapping.map import Map
+from wheretolook.select.rig import read_rig
 from wheretolook.select.where_to_look import WhereToLook
 from wheretolook.utils.errors import CameraError, ConfigError, TableError
 
@@ -45,7 +47,8 @@ def test_a_rig_of_one_camera_scores_as_the_camera_and_the_camera_twice_no_more(l
         assert views.sensor == (*names,) * 4 and views.rank.tolist() == [*range(1, len(names) + 1)] * 4
         for found in (views.score, views.any_score):
             assert_allclose(found.reshape(4, -1), np.tile(expected.score[:, None], len(names)), rtol=1e-6)
-        assert_allclose(views.set_score.reshape(4, -1), np.tile(np.c_[of_sets], len(names)), rtol=1e-5)
+        of_rig = expected.score if len(names) == 1 else np.maximum(of_sets, expected.score)
+        assert_allclose(views.set_score.reshape(4, -1), np.tile(np.c_[of_rig], len(names)), rtol=1e-5)
 
 
 def test_cameras_that_see_different_landmarks_fail_independently(look, tmp_path):
@@ -58,7 +61,7 @@ def test_cameras_that_see_different_landmarks_fail_independently(look, tmp_path)
         assert_allclose(views.score[row], look.score(pose)[0], rtol=1e-6)
     p_none = np.prod(1 - views.score.reshape(4, 3), axis=1)
     assert_allclose(views.any_score.reshape(4, 3), np.tile(1 - p_none[:, None], 3), atol=1e-9)
-    assert (views.set_score > views.score).all()
+    assert (views.set_score >= views.score).all() and (views.any_score >= views.score).all()
     overlapping = look.report_rig(write_rig(tmp_path / "rig.yaml", {"ahead": 0, "right": 45}), POSES)
     bound = 1 - np.prod(1 - overlapping.score.reshape(4, 2), axis=1)
     best = overlapping.score.reshape(4, 2).max(axis=1)
@@ -81,16 +84,26 @@ def test_a_rig_of_the_model_on_the_command_line(tmp_path, monkeypatch):
             rig.add_ref_sensor(sensor)
         else:
             rig.add_sensor(sensor, pycolmap.Rigid3d(pycolmap.Rotation3d(quaternion), [x, 0, 0]))
+    rig.add_sensor(pycolmap.sensor_t(pycolmap.SensorType.IMU, 1), pycolmap.Rigid3d())
     model.add_rig(rig)
+    unknown = pycolmap.Rig(rig_id=8)
+    unknown.add_ref_sensor(pycolmap.sensor_t(pycolmap.SensorType.IMU, 2))
+    model.add_camera(pycolmap.Camera(camera_id=5, model="PINHOLE", width=640, height=480, params=[320, 320, 320, 240]))
+    unknown.add_sensor(model.cameras[5].sensor_id, None)
+    model.add_rig(unknown)
     model.write(str(tmp_path / "sparse"))
     Path("path.tum").write_text(tum_text(["1", "2", "3", "4"], POSES))
     rows = {2: turned(0), 3: turned(60, -0.1), 4: turned(-60, 0.1)}
-    Path("rig.yaml").write_text(
-        "".join(f"{n}: {{camera: '{PINHOLE}', cam_from_rig: {row}}}\n" for n, row in rows.items())
+    Path("rigs").mkdir()
+    Path("rigs/cam.json").write_text('{"w": 640, "h": 480, "fl_x": 320}')
+    Path("rigs/rig.yaml").write_text(
+        "".join(f"{n}: {{camera: cam.json, cam_from_rig: {row}}}\n" for n, row in rows.items())
     )
     command = ["select", "--map", "sparse", "--at", "path.tum", "--weights", str(WEIGHTS), "--device", "cpu"]
-    for source, out in (("7", "a.csv"), ("rig.yaml", "b.csv")):
+    for source, out in (("7", "a.csv"), ("rigs/rig.yaml", "b.csv")):
         assert main([*command, "--rig", source, "--out", out]) == 0
+    with pytest.raises(TableError, match="sensor 5 has no pose in the rig"):
+        read_rig("8", Map.open("sparse"))
     table, same = (pd.read_csv(path, dtype={"sensor": str}) for path in ("a.csv", "b.csv"))
     pd.testing.assert_frame_equal(table, same)
     assert table["waypoint"].tolist() == [1, 1, 1, 2, 2, 2, 3, 3, 3, 4, 4, 4]
@@ -113,6 +126,7 @@ FISHEYE = "OPENCV_FISHEYE,640,480,150,150,320,240,0,0,0,0"
         (f"a: {{cam_from_rig: {turned(0)}}}", TableError, "camera"),
         (f"a: {{camera: '{PINHOLE}', cam_from_rig: [1, 2]}}", TableError, "no rig"),
         ("- a", TableError, "no rig"),
+        ("{}", TableError, "no camera"),
         (None, ConfigError, "unknown rig_id"),
     ],
 )
@@ -132,6 +146,9 @@ def test_rigs_that_cannot_be_scored(look, tmp_path, content, error, message):
         (("select", "--at"), ["--fov", "90"]),
         (("score", "--poses"), ["--accuracy", "0.25,2"]),
         (("score", "--poses"), ["--skip"]),
+        (("score", "--poses"), ["--format", "tum"]),
+        (("select", "--at"), ["--format", "colmap"]),
+        (("extend", "--targets"), []),
     ],
 )
 def test_a_rig_takes_no_limits_of_views_and_no_camera(sparse, tmp_path, command, options, capsys):
@@ -145,3 +162,8 @@ def test_a_method_that_predicts_no_detections_scores_no_rig(sparse, tmp_path):
     look = WhereToLook.from_colmap(sparse, method="visible", device="cpu")
     with pytest.raises(CameraError, match="visible does not predict"):
         look.report_rig(write_rig(tmp_path / "rig.yaml", {"a": 0}), POSES)
+
+
+def test_a_rig_is_scored_at_the_accuracy_of_the_weights(look, tmp_path):
+    with pytest.raises(ConfigError, match="accuracy"):
+        look.at_accuracy((0.25, 2)).report_rig(write_rig(tmp_path / "rig.yaml", {"a": 0}), POSES)

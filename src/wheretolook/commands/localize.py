@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -125,7 +126,7 @@ class Localize(CameraOptions, FrameOptions):
         """Return the camera of all images, its camera_id, the file of the cameras of images, or "panorama"."""
         if self.panorama:
             return "panorama"
-        if self.camera is not None and self.camera_id is None and Path(self.camera).is_file():
+        if self.camera is not None and self.camera_id is None and os.path.isfile(self.camera):
             return Path(self.camera)
         return self.named_camera()
 

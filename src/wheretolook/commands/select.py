@@ -106,7 +106,6 @@ class SelectorOptions(OpenOptions):
         out: file of the views; its ending decides the format.
         format: csv, json, tum, colmap, benchmark or rosbag.
         floor_plan: also draw the views on a plan of the landmarks: a file .png, .pdf or .svg.
-        rig: score all cameras of a rig: a rig_id of the model, or a file as docs/rigs.md describes.
         frame: whose orientations a trajectory or table holds: base (x forward, z up) or camera (z forward). By default
             that of a base if all its z axes are within 45 degrees of up.
     """
@@ -115,14 +114,29 @@ class SelectorOptions(OpenOptions):
     format: str | None = None
     frame: Literal["base", "camera"] | None = None
     floor_plan: Path | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.floor_plan is not None:
+            check_choice("format of figures", self.floor_plan.suffix[1:].lower(), KINDS)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RigOptions(SelectorOptions):
+    """The cameras of a rig.
+
+    Args:
+        rig: score all cameras of a rig: a rig_id of the model, or a file as docs/rigs.md describes. Views are csv or json.
+    """
+
     rig: str | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        alone = self.rig is None or (self.accuracy or self.named_camera()) is None
-        reject((not alone, "a rig has its own cameras: leave cameras and --accuracy out", self.rig))
-        if self.floor_plan is not None:
-            check_choice("format of figures", self.floor_plan.suffix[1:].lower(), KINDS)
+        if self.rig is not None:
+            alone = (self.accuracy or self.named_camera()) is None
+            reject((not alone, "a rig has its own cameras: leave cameras and --accuracy out", self.rig))
+            check_choice("format of the views of a rig", check_format(self.out, self.format, 1), ("csv", "json"))
 
     def open_map(self, path: Path | None = None, **options: Any) -> WhereToLook:
         """Open the map as `OpenOptions`. Raises ConfigError for a rosbag if its unit is unknown."""
@@ -165,7 +179,7 @@ def finish(command: SelectorOptions, selector: WhereToLook, views: Views, given:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Select(SelectionRequest, MaskOptions, SelectorOptions):
+class Select(SelectionRequest, MaskOptions, RigOptions):
     """Select the best views at waypoints of your own COLMAP model; needs no dataset.
 
     Waypoints (--at); the format is recognized by the content:
@@ -232,7 +246,7 @@ class Select(SelectionRequest, MaskOptions, SelectorOptions):
 
     def __post_init__(self) -> None:
         SelectionRequest.__post_init__(self)
-        SelectorOptions.__post_init__(self)
+        RigOptions.__post_init__(self)
         check_format(self.out, self.format, max(self.n, self.looks or 1))
         if self.looks is not None and self.accuracy is not None:
             raise ConfigError("looks are for the accuracy of the weights: leave --accuracy out", value=self.accuracy)
@@ -271,7 +285,7 @@ class Select(SelectionRequest, MaskOptions, SelectorOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Score(SelectorOptions):
+class Score(RigOptions):
     """Score poses of your own in a COLMAP model; needs no dataset.
 
     Poses (--poses), in the frame of the map; camera x right, y down, z forward, or a robot's base (--frame), whose camera

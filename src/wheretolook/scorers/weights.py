@@ -87,16 +87,19 @@ def weights_by_method(path: str | Path, features: str = "") -> dict[str, Path]:
 def find_weights(path: str | Path) -> Path:
     """Return the path of local or bundled weights, or else of those of a name, "owner/name", on the Hugging Face hub.
 
-    Weights in the hub's cache are taken from there; others are downloaded. Raises WeightsError if that fails.
+    Weights in the hub's cache are taken from there; others, also those of an incomplete download, are downloaded. Raises WeightsError if that fails.
     """
     place = or_shipped(path)
     if place.exists() or place.suffix == ".safetensors" or len(place.parts) != 2:
         return place
     home = Path(os.environ.get("HF_HOME", "~/.cache/huggingface")).expanduser()
-    cached = home / "hub" / "--".join(("models", *place.parts))
+    hub = Path(os.environ.get("HF_HUB_CACHE", home / "hub")).expanduser()
+    cached = hub / "--".join(("models", *place.parts))
     try:
         if (cached / "refs/main").is_file():
-            return cached / "snapshots" / (cached / "refs/main").read_text()
+            snapshot = cached / "snapshots" / (cached / "refs/main").read_text()
+            if any(snapshot.glob("*.safetensors")):
+                return snapshot
         from huggingface_hub import snapshot_download
 
         return Path(snapshot_download(place.as_posix()))

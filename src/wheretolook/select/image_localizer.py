@@ -209,9 +209,8 @@ class ImageLocalizer:
             images: a file, or an array (H, W, 3) uint8 RGB; with `turns` several.
             turns: rotations `cam_from_rig` (N, 3, 3), or poses (N, 3, 4) in metres; or a file, see
                 `wheretolook.localization.rig.read_turns`.
-            camera: of the images, or its camera_id in the model, or a file of the cameras of images, a line each: name,
-                MODEL, width, height, parameters; "panorama" for an equirectangular image; None to assume the model's, or
-                the EXIF focal length, see `QueryImages`.
+            camera: of the images, or its camera_id in the model, or a file, see `QueryImages.known_camera`; "panorama" for
+                an equirectangular image; None to assume the model's, or the EXIF focal length, see `QueryImages`.
             prior: rough location x, y, z of the camera in the map, and perhaps yaw in degrees of an image: one more
                 hypothesis, which wins only if the matches support it best.
             accuracy: limits in metres and degrees that the probability refers to.
@@ -237,6 +236,8 @@ class ImageLocalizer:
         known = camera if isinstance(camera, Mapping) else self.images.known_camera(camera)
         names = names or distinct_names([Path(path) for path in paths])
         queries = [self.images.read(image, name, known) for image, name in zip(given, names, strict=True)]
+        if len(queries) > 1 and any(is_panorama(query.camera) for query in queries):
+            raise ConfigError("several panoramas are not localized together: leave the turns out", value=names)
         near = None if prior is None else PosePrior.of(prior, self.frame.world_from_map)
         limits = checked_accuracy(accuracy, self.landmarks.mapping_distance_m)
         exact = self._localizer.joint  # rotations
@@ -244,8 +245,7 @@ class ImageLocalizer:
             faces, cam_from_rig = cut_panorama(queries[0])
             if near is not None:
                 near = replace(near, yaw_deg=None)  # faces look all around
-            of_faces = self._localize(paths * len(faces), faces, cam_from_rig, near, limits, exact)
-            return of_faces.of_panorama(queries[0])
+            return self._localize(paths * len(faces), faces, cam_from_rig, near, limits, exact).of_panorama(queries[0])
         rig = self._rigs if len(queries) > 1 else exact
         results = [self._localize(paths, queries, cam_from_rig, near, limits, rig)]
         if len(queries) == 1:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import filecmp
 import os
+import re
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -20,7 +22,6 @@ from wheretolook.geometry.camera import (
     PinholeCamera,
     camera_of,
     describe_camera,
-    parse_camera,
     read_named_cameras,
     turn_camera,
 )
@@ -31,7 +32,7 @@ from wheretolook.mapping.colmap_model import find_camera
 from wheretolook.mapping.map import Map, find_photographs, has_image, reads_upright
 from wheretolook.mapping.photographs import exif_focal_px, quarters_upright, read_photograph, reduce_photograph
 from wheretolook.utils.errors import ConfigError, PoseError
-from wheretolook.utils.files import path_ends
+from wheretolook.utils.files import path_ends, read_text
 
 KnownCamera = Camera | Mapping[str, Camera]  # of all images, or by their names
 
@@ -83,7 +84,7 @@ class QueryImages:
         self.upright = reads_upright(opened.path)
 
     def known_camera(self, camera: Camera | int | str | Path | None) -> KnownCamera | None:
-        """Return a camera, given as one, by its camera_id, as a text, or as a file: of the cameras of images, or of one (YAML, JSON).
+        """Return a camera, given as one, by its camera_id, as a text, or as a file: of one, or a list of those of images.
 
         "panorama" is an equirectangular camera with as many pixels per degree as the centres of the map's images.
         Raises MapError if the model has no such camera, ConfigError or TableError if the text or the file has none.
@@ -91,11 +92,11 @@ class QueryImages:
         if camera == "panorama":
             half = round(np.pi * np.median([one.colmap.mean_focal_px for one in self.cameras.values()]))
             return ColmapCamera(EQUIRECTANGULAR, 2 * half, half, (2 * half, half))
-        if isinstance(camera, Path) or (isinstance(camera, str) and Path(camera).is_file()):
-            of_all = Path(camera).suffix in (".yaml", ".yml", ".json")
-            return read_camera(str(camera)) if of_all else read_named_cameras(Path(camera))
-        if isinstance(camera, str):
-            return parse_camera(camera)
+        if isinstance(camera, (str, Path)):
+            lists = None
+            with suppress(OSError, ValueError):
+                lists = re.search(r"(?m)^[ \t]*[^#\s].*?\s\w+\s+\d+\s+\d+\s", read_text(Path(camera), 2**28))
+            return read_named_cameras(Path(camera)) if lists else read_camera(str(camera))
         if camera is not None and not isinstance(camera, (int, Camera)):
             fix = "Give a Camera, a camera_id of the model, or a file of cameras."
             raise ConfigError("this is no camera", value=camera, fix=fix)

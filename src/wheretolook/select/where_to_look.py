@@ -289,9 +289,12 @@ class WhereToLook:
         """Score all cameras of a rig, a rig_id or file as of `read_rig`, at poses of the rig (W, 3, 4), world-to-rig.
 
         The best camera of each pose has rank 1. `sensor` names the camera, `any_score` is the probability that at least
-        one localizes alone, `set_score` that all do jointly. Raises errors as `report` and `read_rig`, and CameraError if
-        the scorer does not serve a camera.
+        one localizes alone, `set_score` that all do jointly. Raises errors as `report` and `read_rig`, CameraError if
+        the scorer does not serve a camera, and ConfigError for another accuracy than that of the weights.
         """
+        if self._accuracy is not None:
+            problem = "a rig is scored at the accuracy of the weights: leave the accuracy out"
+            raise ConfigError(problem, value=self._accuracy)
         poses = rigid_poses(rig_from_world)
         parts = []
         scorers = []

@@ -9,8 +9,10 @@ import pycolmap
 import pytest
 from scipy.spatial.transform import Rotation
 
-from selection.room import POINTS
+from selection.room import POINTS, write_room
+from wheretolook.cli import main
 from wheretolook.geometry.similarity import Similarity
+from wheretolook.geometry.views import check_format
 from wheretolook.mapping.georeference import MapScale
 from wheretolook.select.waypoints import read_waypoints
 from wheretolook.utils.errors import ConfigError, StorageError
@@ -108,7 +110,7 @@ def test_invalid_targets_are_rejected(views, look, sparse, tmp_path):
             chosen.save(*target)
 
 
-def test_a_rosbag_holds_the_optical_frames_in_the_world(views, tmp_path):
+def test_a_rosbag_holds_the_optical_frames_in_the_world(views, tmp_path, capsys, monkeypatch):
     pytest.importorskip("rosbags", reason="pip install '.[rosbag]'")
     from rosbags.highlevel import AnyReader
 
@@ -131,3 +133,10 @@ def test_a_rosbag_holds_the_optical_frames_in_the_world(views, tmp_path):
     unknown = replace(views, frame=replace(views.frame, scale=MapScale("unknown")))
     with pytest.raises(ConfigError, match="metres"):
         unknown.save(tmp_path / "other", "rosbag")
+    model = write_room(tmp_path / "unknown", metric=False)
+    outside = ["--at", "1000,0,0", "--device", "cpu"]  # an error of the views would be another one
+    assert main(["select", "--map", str(model), *outside, "--format", "rosbag", "--out", str(tmp_path / "new")]) == 2
+    assert "metres" in capsys.readouterr().err
+    monkeypatch.setattr("wheretolook.utils.package.find_spec", lambda name: None)
+    with pytest.raises(ConfigError, match="rosbags"):
+        check_format(tmp_path / "new", "rosbag", 1)

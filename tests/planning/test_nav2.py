@@ -21,12 +21,15 @@ def read_mask(path):
     about = yaml.safe_load(path.read_text())
     with PIL.Image.open(path.parent / about["image"]) as image:
         assert (image.format, image.mode) == ("PPM", "L")
-        shade = np.asarray(image) / 255
+        pixels = np.asarray(image)
+    shade = pixels / 255
     occupied = shade if about["negate"] else 1 - shade
     high, low = about["occupied_thresh"], about["free_thresh"]
     assert 0 <= low < high <= 1  # map_server refuses others
-    between = {"trinary": -1.0, "scale": np.rint((occupied - low) / (high - low) * 100)}[about["mode"]]
+    between = {"trinary": -1.0, "scale": np.rint((occupied - low) / (high - low) * 100), "raw": 0}[about["mode"]]
     values = np.select([occupied > high, occupied < low], [100.0, 0.0], between)
+    if about["mode"] == "raw":  # without negate and thresholds
+        values = np.where(pixels <= 100, pixels, -1.0)
     x, y, yaw = about["origin"]  # the lower left corner of the lower left cell; the image's first row is the upper one
     assert yaw == 0
     size = about["resolution"]
@@ -40,17 +43,18 @@ def read_mask(path):
 
 
 def check_values(folder, expected):
-    """Compare both masks cell by cell with the best probability at a point, None where no place is."""
-    costs, size = read_mask(folder / "mask.yaml")
+    """Compare the masks cell by cell with the best probability at a point, None where no place is."""
+    costs, size = read_mask(folder / "costs.yaml")
+    limits, _ = read_mask(folder / "mask.yaml")
     closed, _ = read_mask(folder / "keepout.yaml")
     known = 0
     for (x, y), cost in costs.items():
         probability = expected(x, y)
         if probability is None:
-            assert (cost, closed[x, y]) == (0, 0)
+            assert (cost, limits[x, y], closed[x, y]) == (-1, 0, -1)
         else:
-            assert cost <= 99 and abs(cost - 100 * (1 - probability)) <= 1
-            assert closed[x, y] == (100 if probability < 0.5 else 0) or abs(probability - 0.5) < 0.003
+            assert cost == limits[x, y] and 0 <= cost <= 99 and abs(cost - 100 * (1 - probability)) <= 1
+            assert closed[x, y] == (100 if probability < 0.5 else -1) or abs(probability - 0.5) < 0.003
             known += 1
     return known, size
 
@@ -73,8 +77,9 @@ def test_a_viewpoint_map_is_read_back_cell_by_cell(tmp_path, monkeypatch):
     places, probability, _ = places_at_height(viewpoint_map.in_frame(TURNED), 1.2)  # the world is the same
     write_mask(Path("turned"), places, probability, size)
     assert Path("turned/mask.pgm").read_bytes() == Path("masks/mask.pgm").read_bytes()
+    assert main(["viewpoint-map", *options, "--scene", "a", "--camera-z", "1"]) == 2
     places, probability, _ = places_at_height(viewpoint_map, 9.0)  # above the room
-    with pytest.raises(SceneError):
+    with pytest.raises(SceneError, match=r"got 9\.0\)"):
         write_mask(Path("above"), places, probability, size)
 
 
@@ -116,7 +121,12 @@ def test_a_grid_is_read_back_cell_by_cell(tmp_path, monkeypatch, capsys):
             ],
             "probabilities",
         ),
-        ([*given, "--camera-z", "1", "--nav2", "other"], "something else"),
+        ([*given, "--camera-z", "100", "--nav2", "other"], "something else"),
+        ([*given, "--camera-z", "1", "--nav2", "new", "--looks", "2"], "--looks"),
+        ([*given, "--camera-z", "1", "--nav2", "new", "--max-turn", "0"], "--max-turn"),
+        ([*given, "--camera-z", "100"], "--camera-z is outside the map, whose z is "),
+        (["select", "--map", "unknown", "--grid", "1", *options, "--camera-z", "1"], "metres"),
+        (["select", "--map", "sparse", "--at", "2,2,1", *options, "--camera-z", "0"], "need --grid"),
         (["select", "--map", "sparse", "--at", "2,2,1", *options, "--camera-z", "1", "--nav2", "new"], "--grid"),
         (["select", "--map", "unknown", "--grid", "1", *options, "--camera-z", "0", "--nav2", "new"], "metres"),
     ):
@@ -132,18 +142,20 @@ def test_no_place_is_lethal_and_none_is_unscored(tmp_path, probability):
         np.array([probability, 1, np.nan]),
         1.0,
     )
-    costs, _ = read_mask(tmp_path / "m" / "mask.yaml")
-    assert costs == {(0.0, 0.0): min(99, round(100 * (1 - probability))), (0.0, 1.0): 0}
+    for name in ("mask", "costs"):
+        costs, _ = read_mask(tmp_path / "m" / f"{name}.yaml")
+        assert costs == {(0.0, 0.0): min(99, round(100 * (1 - probability))), (0.0, 1.0): 0}
 
 
 def test_the_parameters_of_the_page_name_what_is_written(tmp_path):
     page = (Path(__file__).parents[2] / "docs" / "nav2.md").read_text()
     nodes = yaml.safe_load(page.partition("```yaml\n")[2].partition("```")[0])
-    write_mask(tmp_path / "masks", np.zeros((1, 3)), np.zeros(1), 1.0)
+    places = np.array([(0.0, 0.0, 1.0), (1.0, 1.0, 1.0)])
+    write_mask(tmp_path / "masks", places, np.zeros(2), 1.0)
     topics = set()
-    for name in ("filter_mask_server", "speed_mask_server"):
+    for name, no_view in (("filter_mask_server", -1), ("speed_mask_server", 0)):  # which the SpeedFilter rejects: -1
         served = nodes[name]["ros__parameters"]
-        assert (tmp_path / served["yaml_filename"]).is_file()
+        assert read_mask(tmp_path / served["yaml_filename"])[0][0.0, 1.0] == no_view
         topics.add(served["topic_name"])
     infos = [nodes[f"{name}_filter_info_server"]["ros__parameters"] for name in ("costmap", "speed")]
     assert {info["mask_topic"] for info in infos} == topics

@@ -80,6 +80,7 @@ class Robot(Node):
         self.renderer = renderer
         self.stamp = 100.0
         self.joints = JOINTS
+        self.odom_frame = "odom"
         types = {"image": Image, "image/compressed": CompressedImage, "camera_info": CameraInfo}
         types |= {"odom": Odometry, "joint_states": JointState}
         self.senders = {name: self.create_publisher(kind, name, 10) for name, kind in types.items()}
@@ -181,7 +182,8 @@ class Robot(Node):
             nonlocal sent
             self.send("joint_states", JointState(name=self.joints, position=list(joints)))
             if odometry is not None:
-                odom = Odometry()
+                odom = Odometry(child_frame_id="base_link")
+                odom.header.frame_id = self.odom_frame
                 odom.pose.pose = pose_message(odometry)
                 self.send("odom", odom)
             if info is not None:

@@ -17,7 +17,8 @@ import rclpy
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import Point, Pose, PoseStamped, PoseWithCovarianceStamped, TransformStamped, Vector3Stamped
-from nav_msgs.msg import OccupancyGrid, Path as PathMessage
+from nav_msgs.msg import OccupancyGrid, Odometry, Path as PathMessage
+from rcl_interfaces.msg import Log
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
@@ -254,11 +255,27 @@ def test_odometry_is_placed_in_the_map(node, folder):
     topic = "visual_localization/map_from_odom"  # where tf2_msgs is not installed
     node.create_subscription(TransformStamped, topic, found.append, 10)
     odometry = compose_poses(base_at(-1.0, 4.0, 50.0), BASE)  # its origin is elsewhere
+    node.odom_frame = "wheels"
     with running(LOCALIZER, {"folder": folder, "publish_tf": "true", "odom_frame": "wheels"}):
         node.connected("image", "camera_info", "odom", "joint_states")
         assert node.see(image_of(node.rgb(BASE)), info_of(CAMERA), odometry).message == "localized"
         node.wait(lambda: len(found) > 3, "transforms")
-    sent = found[-1]
+        sent = found[-1]
+        node.see(image_of(np.zeros((480, 640, 3), np.uint8)), info_of(CAMERA), step_s=-50.0)  # time jumps back
+        for _ in range(20):
+            rclpy.spin_once(node, timeout_sec=0.05)  # what was sent before
+        count = len(found)
+        for _ in range(20):
+            rclpy.spin_once(node, timeout_sec=0.05)
+        assert len(found) == count
+        for frame, child, problem in (
+            ("odom", "base_link", "odom: frame is 'odom', expected 'wheels'"),
+            ("wheels", "wheel", "odom: child frame is 'wheel', expected 'base_link'"),
+        ):
+            message = Odometry(child_frame_id=child)
+            message.header.frame_id = frame
+            node.send("odom", message)
+            node.reported(problem)
     assert (sent.header.frame_id, sent.child_frame_id) == ("map", "wheels")
     moved = sent.transform.translation
     pose = Pose(position=Point(x=moved.x, y=moved.y, z=moved.z), orientation=sent.transform.rotation)
@@ -278,12 +295,30 @@ def test_localizability_is_latched_and_a_robot_turns_to_the_view(node, folder, t
         node.create_subscription(OccupancyGrid, "localizability", grids.append, latched)
         node.create_subscription(PoseStamped, "gaze/goal_pose", goals.append, 10)
         grid = node.wait(lambda: grids and grids[0], "the latched grid")
-        _, _, direction = gaze.joints(BASE)
-        goal = node.wait(lambda: (gaze.joints(BASE), goals)[1], "a goal")[-1]
+        gaze.joints(BASE)
+        assert not goals  # one would replace that of a robot that is localized
+        look = Vector3Stamped()
+        look.header.frame_id = "base_link"
+        look.vector.y = -2.0
+        goal = node.wait(lambda: (node.ask("look", look, "gaze/direction"), goals)[1], "a goal")[-1]
+        gaze.joints(BASE)
+        n_goals = len(goals)
+        gaze.joints(BASE)
+        assert len(goals) == n_goals
     assert grid.header.frame_id == "map" and (grid.info.width, grid.info.height) == (2, 3)
     origin = grid.info.origin.position
     assert (origin.x, origin.y, round(grid.info.resolution, 6)) == (0.75, 1.75, 0.5)
     assert list(grid.data) == [20, 100, -1, -1, 50, -1]
     assert goal.header.frame_id == "base_link" and (goal.header.stamp.sec, goal.pose.position.x) == (0, 0.0)
     forward = pose_matrix(goal.pose)[:, 0]
-    np.testing.assert_allclose(forward[:2], np.array(direction)[:2] / np.linalg.norm(direction[:2]), atol=1e-6)
+    np.testing.assert_allclose(forward, (0, -1, 0), atol=1e-6)
+
+
+def test_a_mask_that_is_missing_is_reported_and_the_node_continues(node, folder, tmp_path):
+    logged = []
+    latched = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    node.create_subscription(Log, "/rosout", logged.append, latched)
+    with running(GAZE, {"folder": folder, "mask": tmp_path / "none"}):
+        Gaze(node, folder).joints(BASE)
+        text = f"mask {tmp_path / 'none'} is not published: "
+        node.wait(lambda: any(one.msg.startswith(text) for one in logged), text)

@@ -138,6 +138,13 @@ class RigOptions(SelectorOptions):
             reject((not alone, "a rig has its own cameras: leave cameras and --accuracy out", self.rig))
             check_choice("format of the views of a rig", check_format(self.out, self.format, 1), ("csv", "json"))
 
+    def open_map(self, path: Path | None = None, **options: Any) -> WhereToLook:
+        """Open the map as `OpenOptions`. Raises ConfigError for a rosbag if its unit is unknown."""
+        selector = super().open_map(path, **options)
+        if self.format == "rosbag":
+            selector.frame.check_metric("a rosbag is")
+        return selector
+
 
 def finish(command: SelectorOptions, selector: WhereToLook, views: Views, given: int, locations: str) -> None:
     """Write views and the floor plan, and print a summary; `locations` names the kind of what was `given`."""
@@ -243,10 +250,12 @@ class Select(SelectionRequest, MaskOptions, RigOptions):
         check_format(self.out, self.format, max(self.n, self.looks or 1))
         if self.looks is not None and self.accuracy is not None:
             raise ConfigError("looks are for the accuracy of the weights: leave --accuracy out", value=self.accuracy)
-        of_grid = self.nav2 or self.camera_z
+        of_grid = self.nav2 is not None or self.camera_z is not None
+        turn = self.looks or self.max_turn_deg
         reject(
             (bool(self.at) == (self.grid is not None), "waypoints are given by either --at or --grid", None),
-            (bool(self.at and of_grid), "--nav2 and --camera-z need --grid", str(of_grid)),
+            (bool(self.at and of_grid), "--nav2 and --camera-z need --grid", None),
+            (bool(self.nav2) and turn is not None, "masks are of best views: leave --looks and --max-turn out", turn),
         )
 
     def run(self) -> Views:
@@ -262,7 +271,7 @@ class Select(SelectionRequest, MaskOptions, RigOptions):
         waypoints = given_waypoints(self.at, self.frame) if self.at else None
         selector = self.open_map(directions=self.directions, lattice=self.lattice)
         if self.nav2:
-            check_mask(selector.scorer, self.camera_z)
+            check_mask(self.nav2, selector.scorer, self.camera_z)
         if waypoints is None:
             assert self.grid is not None
             waypoints = selector.grid(self.grid, self.camera_z)

@@ -19,7 +19,7 @@ from wheretolook.commands.options import (
 from wheretolook.dataset.dataset_lock import reads_dataset
 from wheretolook.planning.config import MappedLattice
 from wheretolook.scorers.weights import resolve_weights
-from wheretolook.utils.errors import ConfigError
+from wheretolook.utils.errors import ConfigError, reject
 
 if TYPE_CHECKING:
     from wheretolook.planning.viewpoint_map import ViewpointMap
@@ -67,6 +67,7 @@ class BuildViewpointMap(MappedLattice, MaskOptions, SceneOrMapOptions):
     def __post_init__(self) -> None:
         MappedLattice.__post_init__(self)
         SceneOrMapOptions.__post_init__(self)
+        reject((self.camera_z is not None and self.nav2 is None, "--camera-z needs --nav2", self.camera_z))
 
     @imports_map
     @reads_dataset("viewpoint-map")
@@ -74,9 +75,8 @@ class BuildViewpointMap(MappedLattice, MaskOptions, SceneOrMapOptions):
         """Write `<scene>/viewpoint-map/`, and return the viewpoint maps by the scene's name. Needs `map` only.
 
         Raises:
-            ConfigError: no such scene or method, or the method needs weights. WeightsError: the weights cannot be used.
+            ConfigError: no such scene or method, the method needs weights, or masks for Nav2 (`check_mask`). WeightsError: the weights cannot be used.
             SceneError: there is no mesh, or no voxel is free. MapFormatError: the map's folder holds something else.
-            MapError: a mask for Nav2 is wanted of a map of unknown unit.
         """
         from wheretolook.planning.nav2 import check_mask, places_at_height, write_mask
         from wheretolook.planning.scene_map import scene_scorer, scene_viewpoint_map
@@ -97,7 +97,7 @@ class BuildViewpointMap(MappedLattice, MaskOptions, SceneOrMapOptions):
             with naming_file(scene.folder.source):
                 scorer = scene_scorer(scene, self.method, weights, self.anywhere, self.accuracy)
                 if self.nav2:
-                    check_mask(scorer, self.camera_z)
+                    check_mask(self.nav2, scorer, self.camera_z)
                 viewpoint_map = scene_viewpoint_map(scene, self, scorer)
             folder = self.out or files.folder / "viewpoint-map"
             viewpoint_map.save(folder)

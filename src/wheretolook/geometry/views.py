@@ -261,12 +261,14 @@ def check_format(path: Path, format: str | None, n: int) -> str:
     """Return the format for n views of each waypoint: the given one, or else that of the file's name.
 
     The names are .csv, .json, .tum, images.txt; a folder is for COLMAP. Raises ConfigError if there is no such format,
-    the format holds one view only, or the path holds something else; StorageError if nothing can be written there.
+    its package is missing, the format holds one view only, or the path holds something else; StorageError if nothing can be written there.
     """
     by_suffix = {".csv": "csv", ".json": "json", ".tum": "tum", "": "colmap"}
     by_name = "colmap" if path.name == "images.txt" else by_suffix.get(path.suffix.lower(), path.suffix)
     chosen = format or by_name
     check_choice("format of views", chosen, FORMATS)
+    if chosen == "rosbag":
+        require("rosbags")
     if chosen in ("tum", "benchmark") and n > 1:
         fix = "Ask for one view, or write csv, json or colmap."
         raise ConfigError(f"a file of the format {chosen} has one view of each waypoint", value=n, fix=fix)
@@ -329,7 +331,6 @@ def _json_content(views: Views) -> dict[str, Any]:
 
 def _write_bag(folder: Path, views: Views) -> None:
     """Write a rosbag with a nav_msgs/Path of the optical frames. Raises ConfigError if the map's unit is unknown."""
-    require("rosbags")
     from rosbags.rosbag2 import Writer
     from rosbags.typesys import Stores, get_typestore
 

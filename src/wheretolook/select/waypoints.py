@@ -157,12 +157,16 @@ def grid_waypoints(
 ) -> Waypoints:
     """Return locations in the world, `spacing_m` apart in all free space, or at one height; their names are voxel ids.
 
-    Raises a ConfigError if the spacing is no length or makes too many, a SceneError if none is free.
+    Raises a ConfigError if the spacing is no length or makes too many, or the height is outside the map or its unit
+    unknown, a SceneError if none is free.
     """
     if not 0 < spacing_m < np.inf:
         raise ConfigError("the spacing of a grid is a length in metres", value=spacing_m, fix="Such as 0.5.")
     low, high = np.array(space.bounds, dtype=np.float64)
     if height_m is not None:
+        localization_map.frame.check_metric("--camera-z is")
+        problem = f"--camera-z is outside the map, whose z is {low[2]:.3g} to {high[2]:.3g} m"
+        reject((not low[2] <= height_m <= high[2], problem, height_m))
         low[2] = high[2] = height_m
     cells = np.maximum(np.ceil((high - low) / spacing_m), 1)
     if np.prod(cells) > MAX_LOCATIONS:
@@ -175,7 +179,9 @@ def grid_waypoints(
     free = np.flatnonzero(space.is_free(centers))
     free = free[~localization_map.occlusion.inside_geometry(centers[free])]
     if len(free) == 0:
-        raise SceneError("no location of the grid is free", value=spacing_m, fix="Narrow the grid.")
+        raise SceneError(
+            "no location of the grid is free", value=spacing_m, fix="Narrow the grid, or correct --camera-z."
+        )
     return Waypoints(centers[free], tuple(map(str, free)))
 
 

@@ -111,11 +111,11 @@ class MaskComparison(SceneComparison):
         """The paths and views of the three methods, without labels."""
         scene = self.scene
         scorer = scene_scorer(scene, "set", self.weights["set"])
-        check_mask(scorer, self.height_m)
+        masks = self.folder / "masks"
+        check_mask(masks, scorer, self.height_m)
         points = grid_waypoints(scene.localization_map, scene.space, self.cell_m, self.height_m).points
         axes = within_pitch(self.config.axes(), self.config.planner)
         scores = scorer.score_directions(points, axes)
-        masks = self.folder / "masks"
         write_mask(masks, points, scores.max(axis=1), self.cell_m)
         costs = self.weight * read_costs(masks, points, self.cell_m)
         cells = CellGraph.of(points, scene.space, self.cell_m)

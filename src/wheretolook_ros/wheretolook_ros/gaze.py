@@ -26,7 +26,7 @@ from wheretolook_ros.conversions import (
     pose_matrix,
     pose_message,
 )
-from wheretolook_ros.node import OK, RobotNode, run
+from wheretolook_ros.node import OK, WARN, RobotNode, run
 
 REUSED_M = 0.3  # within which the best view is not searched again
 
@@ -44,6 +44,8 @@ class GazeNode(RobotNode):
         self._gaze = self.create_publisher(Vector3Stamped, "gaze/direction", 10)
         self._views = self.create_publisher(Path, "gaze/views", 10)
         self._goals = self.create_publisher(PoseStamped, "gaze/goal_pose", 10)
+        if self.settings.mask:
+            self._publish_mask(self.settings.mask)
         self.listen(PoseWithCovarianceStamped, "visual_localization/pose", self._on_pose)
         self.listen(Vector3Stamped, "visual_localization/next_look", self._on_next_look)
         self.listen(Path, "plan", self._on_path)
@@ -52,16 +54,26 @@ class GazeNode(RobotNode):
         self._scorer = RobotScorer(folder)
         self._axes = fibonacci_sphere(self.settings.directions)
         self._limit = TurnLimit.of(self._axes, self.settings.max_turn_deg, pan_tilt=True)
-        if self.settings.mask:
-            latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-            grids = self.create_publisher(OccupancyGrid, "localizability", latched)
-            grids.publish(localizability_message(pathlib.Path(self.settings.mask), self.settings.map_frame))
+
+    def _publish_mask(self, folder: str) -> None:
+        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        grids = self.create_publisher(OccupancyGrid, "localizability", latched)
+        try:
+            grids.publish(localizability_message(pathlib.Path(folder), self.settings.map_frame))
+        except Exception as error:  # whatever its files hold
+            self.report(WARN, f"mask {folder} is not published: {error}")
 
     def _on_next_look(self, message: Vector3Stamped) -> None:
         """Look where the localizer asks."""
         self.check_frame(message, "base_frame")
         vector = message.vector
-        self._look(np.array([vector.x, vector.y, vector.z]), "not localized: looking at the next view")
+        direction = np.array([vector.x, vector.y, vector.z])
+        self._look(direction, "not localized: looking at the next view")
+        if not any(self.joint_names):  # the robot turns; without a stamp, since its latest pose counts
+            pan = self.head.joints(direction)[0]
+            goal = np.column_stack([Rotation.from_euler("z", pan).as_matrix(), np.zeros(3)])
+            header = Header(frame_id=self.settings.base_frame)
+            self._goals.publish(PoseStamped(header=header, pose=pose_message(goal)))
 
     def _on_pose(self, message: PoseWithCovarianceStamped) -> None:
         """Look along the nearest view of the path, or else along the best view here."""
@@ -127,10 +139,6 @@ class GazeNode(RobotNode):
         axis = self.head.nearest(direction)[0]
         self._gaze.publish(direction_message(axis, self.settings.base_frame, self.get_clock().now().to_msg()))
         moved = {name: value for name, value in zip(self.joint_names, joints.tolist(), strict=True) if name}
-        if not moved:  # the robot turns; without a stamp, since its latest pose counts
-            goal = np.column_stack([Rotation.from_euler("z", joints[0]).as_matrix(), np.zeros(3)])
-            header = Header(frame_id=self.settings.base_frame)
-            self._goals.publish(PoseStamped(header=header, pose=pose_message(goal)))
         point = JointTrajectoryPoint(positions=[*moved.values()])
         point.time_from_start = Duration(seconds=self.settings.turn_duration_s).to_msg()
         self._joints.publish(JointTrajectory(joint_names=[*moved], points=[point]))

@@ -99,6 +99,11 @@ class LocalizerNode(RobotNode):
         self._info = message
 
     def _on_odometry(self, message: Odometry) -> None:
+        if self.settings.publish_tf:  # else the transform would be of other frames
+            self.check_frame(message, "odom_frame")
+            child, expected = message.child_frame_id, self.settings.base_frame
+            if child != expected:
+                raise ValueError(f"child frame is {child!r}, expected {expected!r}")
         self._odometry.add(message.header.stamp, pose_matrix(message.pose.pose).ravel())
 
     def _on_joints(self, message: JointState) -> None:
@@ -151,6 +156,7 @@ class LocalizerNode(RobotNode):
                 WARN, f"image: time jumped back by {self._last_stamp - stamp:.2f} s; earlier images are discarded"
             )
             self._sequence.reset()
+            self._map_from_odom = None
         self._last_stamp = stamp
         started = time.monotonic()
         try:

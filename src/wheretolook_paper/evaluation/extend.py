@@ -21,9 +21,10 @@ def outcomes(table: pd.DataFrame) -> pd.DataFrame:
 
     `table` is that of `wheretolook_paper.studies.extend`. A view is of a map: a scene and a seed.
     """
+    columns = (table[name] for name in ("scene", "seed", "policy", "localized"))
     localized = {
-        (row.scene, row.seed, row.policy): pd.Series([float(mark == "x") for mark in row.localized])
-        for row in table.itertuples()
+        (scene, seed, policy): pd.Series([float(mark == "x") for mark in marks])
+        for scene, seed, policy, marks in zip(*columns, strict=True)
     }
     names = ["scene", "seed", "policy", "view"]
     return pd.concat(localized, names=names).unstack("policy")

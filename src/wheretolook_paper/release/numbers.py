@@ -18,6 +18,7 @@ from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 
 from wheretolook_paper.evaluation.comparison import interval_text
@@ -277,8 +278,8 @@ class Numbers:
         views, _ = self._extended
         of_scene = table[table["scene"] == name].groupby("policy")[["strict", "predicted"]].mean()
         counts = difference(views.loc[[name]], "pairs", "none")
-        shares = [of_scene.loc[policy, column] for column in ("strict", "predicted") for policy in ("none", "pairs")]
-        cells = [f"{100 * share:.0f}" for share in shares]
+        shares = 100 * of_scene.loc[["none", "pairs"]].to_numpy(np.float64).T.ravel()
+        cells = [f"{share:.0f}" for share in shares]
         return [cells[0], cells[1], f"{counts['won']} / {counts['lost']}", cells[2], cells[3]]
 
     def extended_photographs(self, label: str) -> list[str]:

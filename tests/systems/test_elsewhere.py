@@ -42,7 +42,9 @@ def test_select_and_score(tmp_path):
 @pytest.mark.slow
 def test_from_scenes_to_evaluation(tmp_path):
     (tmp_path / "tiny.yaml").write_text(
-        EXPERIMENT.replace("workers: 1", "workers: 2").replace("[mlp-2d, mlp-2d+3d, set]", "[mlp-2d]")
+        EXPERIMENT.replace("workers: 1", "workers: 2")
+        .replace("[mlp-2d, mlp-2d+3d, set]", "[mlp-2d]")
+        .replace("mlp, set]", "mlp]")
     )
     stages = ("scenes", "map", "sample", "label", "train", "evaluate")
     run_elsewhere(tmp_path, *([stage, "--config", "tiny.yaml", "--device", "cpu"] for stage in stages))

@@ -77,7 +77,7 @@ def test_scenes_of_the_release_are_drawn_with_the_runs_of_their_weights(tmp_path
     }  # fmt: skip
     config = PlanConfig(grid=(4, 4, 2), directions=40, planner=PathConfig(time_s=4.0))
     views = planned_views(open_showcase(release), release, ("forward", "bins"), config)
-    ends = [[path[0].position, path[-1].position] for path in views.values()]
+    ends = [path.positions[[0, -1]] for path in views.values()]
     np.testing.assert_allclose(ends[0], ends[1], atol=1e-6)
     assert np.linalg.norm(np.diff(ends[0], axis=0)) > 4  # the farthest of ten pairs
 

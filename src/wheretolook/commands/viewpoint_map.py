@@ -75,7 +75,8 @@ class BuildViewpointMap(MappedLattice, MaskOptions, SceneOrMapOptions):
         """Write `<scene>/viewpoint-map/`, and return the viewpoint maps by the scene's name. Needs `map` only.
 
         Raises:
-            ConfigError: no such scene or method, the method needs weights, or masks for Nav2 (`check_mask`). WeightsError: the weights cannot be used.
+            ConfigError: no such scene or method, the method needs weights, or masks for Nav2 (`check_mask`).
+            WeightsError: the weights cannot be used.
             SceneError: there is no mesh, or no voxel is free. MapFormatError: the map's folder holds something else.
         """
         from wheretolook.planning.nav2 import check_mask, places_at_height, write_mask

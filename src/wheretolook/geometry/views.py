@@ -261,7 +261,8 @@ def check_format(path: Path, format: str | None, n: int) -> str:
     """Return the format for n views of each waypoint: the given one, or else that of the file's name.
 
     The names are .csv, .json, .tum, images.txt; a folder is for COLMAP. Raises ConfigError if there is no such format,
-    its package is missing, the format holds one view only, or the path holds something else; StorageError if nothing can be written there.
+    its package is missing, the format holds one view only, or the path holds something else; StorageError if nothing
+    can be written there.
     """
     by_suffix = {".csv": "csv", ".json": "json", ".tum": "tum", "": "colmap"}
     by_name = "colmap" if path.name == "images.txt" else by_suffix.get(path.suffix.lower(), path.suffix)

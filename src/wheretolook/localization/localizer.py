@@ -70,8 +70,7 @@ class Localizer:
     neighbours; the pose is estimated by `PoseEstimator`. The extractor must be that of the map, and may be omitted if
     nothing is extracted. The device is "cpu" or a CUDA device. LightGlue (`LocalizerConfig.lightglue`) needs the folder
     of the map, `map_dir`, and the features of its images, by default its database. `photographs` is whether these are
-    photographs. Raises MapError if the landmarks have
-    no descriptors, or not the extractor's.
+    photographs. Raises MapError if the landmarks have no descriptors, or not the extractor's.
     """
 
     def __init__(

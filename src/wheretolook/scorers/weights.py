@@ -32,8 +32,9 @@ def resolve_weights(
     """Return the weights file that a method or a family scores with; None for a method without weights.
 
     An empty `method` stands for any that scores views by itself. A `path` is a file, or a folder or name on the hub of
-    which the best file is taken (`find_weights`). Without one the candidates are the files in the `dataset`'s folder, then in the release next to it, then
-    the bundled ones. In a folder, files trained on the map's `features` come first.
+    which the best file is taken (`find_weights`). Without one the candidates are the files in the `dataset`'s folder,
+    then in the release next to it, then the bundled ones. In a folder, files trained on the map's `features` come
+    first.
 
     With a `dataset`, `features` default to those of its maps, a given file of another method is passed over, files that
     do not fit (unreadable, of another field of view, or trained on data that has changed) are reported to `log`, and
@@ -87,7 +88,8 @@ def weights_by_method(path: str | Path, features: str = "") -> dict[str, Path]:
 def find_weights(path: str | Path) -> Path:
     """Return the path of local or bundled weights, or else of those of a name, "owner/name", on the Hugging Face hub.
 
-    Weights in the hub's cache are taken from there; others, also those of an incomplete download, are downloaded. Raises WeightsError if that fails.
+    Weights in the hub's cache are taken from there; others, also those of an incomplete download, are downloaded. Raises
+    WeightsError if that fails.
     """
     place = or_shipped(path)
     if place.exists() or place.suffix == ".safetensors" or len(place.parts) != 2:
@@ -112,8 +114,9 @@ def load_scorer(localization_map: LocalizationMap, weights: str | Path | None = 
     """Return the learned scorer of a map: `load_scorer(localization_map).score(cam_from_world)`.
 
     `weights` are a file that the train command wrote, whose header names the method, or a folder of such files, of
-    which `resolve_weights` takes the best, or a name on the Hugging Face hub, "owner/name"; None for the bundled ones. A path such as `data/release/weights` names
-    bundled files from any working directory. With `anywhere`, weights adapted to one scene score in another.
+    which `resolve_weights` takes the best, or a name on the Hugging Face hub, "owner/name"; None for the bundled ones.
+    A path such as `data/release/weights` names bundled files from any working directory. With `anywhere`, weights
+    adapted to one scene score in another.
 
     Raises:
         WeightsError: the weights are unusable, or adapted to another scene.

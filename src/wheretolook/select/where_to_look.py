@@ -108,8 +108,8 @@ class WhereToLook:
             weights: file or folder of weights, or their name on the Hugging Face hub; None for the bundled ones.
             method: name of a method, such as "set" or "visible"; "" for that of the weights.
             camera: the camera of the views: a camera, a text such as "PINHOLE,640,480,320,320,320,240", a file as
-                `read_camera` reads it, or the camera_id of one of the model. None for the model's own; "each" for that of the image of the same name,
-                in `report`.
+                `read_camera` reads it, or the camera_id of one of the model. None for the model's camera; "each" for that
+                of the image of the same name, in `report`.
             fov_deg: instead, a pinhole of that horizontal field of view in degrees, of 640 x 480 px.
             mesh: mesh of the scene in the map's frame, for true occlusion.
             mesh_up: which axis of the mesh's file is the map's z: "x", "y" or "z", with "-" if it points down.

@@ -67,8 +67,9 @@ def test_all_directions_at_once_score_as_one_by_one(camera, tmp_path):
     # by a camera of COLMAP, views that only it can decide may be sampled otherwise
     for limit in (512, 64) if camera is None else (512,):
         sampled, strides = score_directions_plain(scorer, POINTS, AXES, limit)
-        batched = BatchedDirections(localization_map, scorer.trained, AXES, limit, scorer.accuracy)
-        np.testing.assert_allclose(batched.score(POINTS), sampled, atol=1e-4)
+        for lanes in (1, 4):  # as on a CPU and on a GPU
+            batched = BatchedDirections(localization_map, scorer.trained, AXES, limit, scorer.accuracy, lanes)
+            np.testing.assert_allclose(batched.score(POINTS)[0], sampled, atol=1e-4)
     assert (strides.max() > 1) == (camera is None)
 
 

@@ -30,7 +30,7 @@ from wheretolook.rendering.warp_renderer import Renderer, WarpRenderer
 from wheretolook.scenes.loading import load_mesh
 from wheretolook.utils.devices import run_halving
 from wheretolook.utils.errors import WhereToLookError, WorkerError
-from wheretolook.utils.processes import WorkerPool, worker_number
+from wheretolook.utils.processes import WorkerPool, cores, worker_number
 
 _END = object()
 """Marks the end of the items."""
@@ -164,6 +164,15 @@ class ShardWorker:
         return self._scene[1:]
 
 
+def processes_of(job: SceneJob) -> int:
+    """Number of processes that label: one for each GPU if all steps run there, otherwise one for each core."""
+    cameras = [job.camera, *(camera for _, camera in job.cameras)]
+    pinholes = all(isinstance(camera, PinholeCamera) for camera in cameras)
+    if job.device == "cpu" or job.extractor.method == "colmap" or not pinholes:
+        return cores()
+    return torch.cuda.device_count() if job.device == "cuda" else 1
+
+
 _worker: ShardWorker | None = None
 
 
@@ -204,8 +213,8 @@ def label_rows(
     drawn = Appearance.of_views(true_poses, job.appearance, seed) if job.appearance else []
     is_changed = _is_changed(table, seed) if changed else np.zeros(len(table), dtype=bool)
     batches = []
-    # viewpoints of 640 x 480, unless the extractor takes more; poses on a GPU take as long for 8 as for 64
-    batch_size = max(64 if localizer.in_batches else 8, localizer.extractor.batch_of(640, 480))
+    # viewpoints of 640 x 480, unless the extractor takes more; on a GPU each step has the same number of launches
+    batch_size = max(256 if localizer.in_batches else 8, localizer.extractor.batch_of(640, 480))
     for camera, rows in _by_camera(table, job):
         size = min(batch_size, max(1, batch_size * 640 * 480 // (camera.width * camera.height)))
         shown_in = [(renderer, rows[~is_changed[rows]])]

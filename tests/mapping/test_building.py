@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.mesh import TexturedMesh
-from wheretolook.geometry.poses import poses_looking_along
+from wheretolook.geometry.poses import pose_error, poses_looking_along
 from wheretolook.mapping import triangulation
 from wheretolook.mapping.colmap_model import colmap_poses
 from wheretolook.mapping.config import MIN_TRIANGULATION_ANGLE_DEG, MapConfig
@@ -87,6 +87,23 @@ def test_a_varied_map_with_appearance_is_of_fewer_and_changed_images(built, room
         assert np.abs(image.astype(int) - expected).mean() < 0.1
         changes.append(np.abs(image.astype(int) - rendering.rgb[0]).mean())
     assert min(changes) > 0.5 and max(changes) > 10
+
+
+def test_estimated_poses_are_near_those_of_the_walk(room, room_free_space, renderer, tmp_path):
+    folder = tmp_path / "map"
+    config = MapConfig(n_images=10, drift=True)
+    report = build_map(room, renderer, room_free_space, CAMERA, config, SEED, folder, workers=1, progress=False)
+    walk = plan_walk(room_free_space, room.bounds, config.n_images, SEED)
+    exact = poses_looking_along(walk.positions, walk.directions)
+    model = pycolmap.Reconstruction(str(folder))
+    images = [model.images[number] for number in sorted(model.images)]
+    observing = [image.num_points3D > 20 for image in images]
+    errors = np.array(
+        [pose_error(image.cam_from_world().matrix(), pose) for image, pose in zip(images, exact, strict=True)]
+    )
+    assert 1e-4 < np.median(errors[observing, 0]) < 0.05 and np.median(errors[observing, 1]) < 0.5
+    assert 1e-4 < abs(model.cameras[1].focal_length / CAMERA.fx - 1) < 0.02
+    assert report.median_distance_to_mesh_cm < 5
 
 
 def test_landmarks_project_to_their_keypoints(built):

@@ -288,6 +288,9 @@ class MapConfig:
         vary: draw from the scene's seed how it is photographed: on a walk through a part of it or all, with even spacing
             or turning on the spot, and with 8 to 100 % of `n_images`. From a few steps, baselines are narrow. Scans
             ignore it, with a warning.
+        drift: estimate the poses of mapping images and their focal length, as structure from motion does, in place of
+            exact ones. Images are matched with at least 3 that follow, a number drawn from the scene's seed: baselines are
+            narrow and poses drift where it is small. `draw_camera` then draws as `sample.any_lens`.
         appearance: highest strength, 0 to 1, of what a real camera and people in front of it do to mapping images; see
             `label.appearance`.
         keep_images: keep the rendered images, as `images/` in the map's folder.
@@ -301,6 +304,7 @@ class MapConfig:
     camera: CameraConfig | None = None
     draw_camera: bool = False
     vary: bool = False
+    drift: bool = False
     appearance: float = 0.0
     keep_images: bool = False
     keep_database: bool = False
@@ -315,7 +319,7 @@ class MapConfig:
     @property
     def of_renders(self) -> list[str]:
         """Names of the options given that are for maps of renders only."""
-        names = ("camera", "draw_camera", "vary", "appearance", "keep_images")
+        names = ("camera", "draw_camera", "vary", "drift", "appearance", "keep_images")
         return [f"mapping.{name}" for name in names if getattr(self, name)]
 
     def report(self) -> dict[str, Any]:
@@ -326,7 +330,7 @@ class MapConfig:
         """Settings and constants, from which the keys of finished maps are made; without the mapping camera."""
         settings = asdict(self)
         del settings["camera"], settings["draw_camera"]
-        for name in ("vary", "appearance"):  # maps made before these options existed keep their keys
+        for name in ("vary", "drift", "appearance"):  # maps made before these options existed keep their keys
             if not settings[name]:
                 del settings[name]
         return {

@@ -91,7 +91,7 @@ def test_a_varied_map_with_appearance_is_of_fewer_and_changed_images(built, room
 
 def test_estimated_poses_are_near_those_of_the_walk(room, room_free_space, renderer, tmp_path):
     folder = tmp_path / "map"
-    config = MapConfig(n_images=10, drift=True)
+    config = MapConfig(n_images=10, vary="drift")
     report = build_map(room, renderer, room_free_space, CAMERA, config, SEED, folder, workers=1, progress=False)
     walk = plan_walk(room_free_space, room.bounds, config.n_images, SEED)
     exact = poses_looking_along(walk.positions, walk.directions)

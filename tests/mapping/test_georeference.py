@@ -166,14 +166,7 @@ def test_invalid_settings_are_rejected():
 
 @pytest.mark.parametrize("source", [{"photographs": PhotographsConfig(Path("photos"))}, {"model": Path("model")}])
 def test_options_of_renders_are_rejected_by_name_for_other_maps(source):
-    of_renders = {
-        "camera": CameraConfig(),
-        "draw_camera": True,
-        "vary": True,
-        "drift": True,
-        "appearance": 0.4,
-        "keep_images": True,
-    }
+    of_renders = {"camera": CameraConfig(), "draw_camera": True, "vary": True, "appearance": 0.4, "keep_images": True}
     BuildMap(**source, mapping=MapConfig(keep_database=True))
     for name, value in of_renders.items():
         BuildMap(mapping=MapConfig(**{name: value}))

@@ -274,12 +274,12 @@ def build_map(  # a scene has four parts, and the output and its resources are t
             stored, colors = zip(*extracted, strict=True)
         with clock("pairs"):
             pairs = choose_pairs(surface_overlap(camera, poses, np.stack(depth)), PARTNERS)
-            if config.drift:
+            if config.vary == "drift":
                 furthest = np.exp(np.random.default_rng([seed, 3]).uniform(np.log(3), np.log(len(poses))))
                 pairs = pairs[pairs[:, 1] - pairs[:, 0] <= furthest]
         database = folder / DATABASE_FILE
         model = triangulate_model(database, posed_model(camera, poses), stored, colors, pairs, run)
-        if config.drift:
+        if config.vary == "drift":
             with clock("adjust"):
                 estimate_poses(model)
         fix = "Map with more images (n_images), or check that the scene has texture."

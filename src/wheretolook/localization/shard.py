@@ -32,6 +32,9 @@ from wheretolook.utils.devices import run_halving
 from wheretolook.utils.errors import WhereToLookError, WorkerError
 from wheretolook.utils.processes import WorkerPool, cores, worker_number
 
+GPU_BATCH = 256
+"""Viewpoints of 640 x 480 that a GPU labels at a time: poses take as many launches for one."""
+
 _END = object()
 """Marks the end of the items."""
 
@@ -213,8 +216,7 @@ def label_rows(
     drawn = Appearance.of_views(true_poses, job.appearance, seed) if job.appearance else []
     is_changed = _is_changed(table, seed) if changed else np.zeros(len(table), dtype=bool)
     batches = []
-    # viewpoints of 640 x 480, unless the extractor takes more; on a GPU each step has the same number of launches
-    batch_size = max(256 if localizer.in_batches else 8, localizer.extractor.batch_of(640, 480))
+    batch_size = max(GPU_BATCH if localizer.in_batches else 8, localizer.extractor.batch_of(640, 480))
     for camera, rows in _by_camera(table, job):
         size = min(batch_size, max(1, batch_size * 640 * 480 // (camera.width * camera.height)))
         shown_in = [(renderer, rows[~is_changed[rows]])]

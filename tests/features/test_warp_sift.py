@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import torch
 import warp as wp
 from scipy.spatial import KDTree
 
@@ -78,7 +79,7 @@ def test_an_image_gives_the_same_bits_in_any_batch_and_every_time(device):
 def test_grey_images_are_those_of_colmap(device):
     images = np.random.default_rng(0).integers(0, 256, (3, 97, 101, 3), dtype=np.uint8)
     expected = [grey_bitmap(rgb).to_array() for rgb in images]
-    for of_images in (images, list(images)):
+    for of_images in (images, list(images), list(torch.tensor(images, device=device))):
         np.testing.assert_array_equal(grey_images(of_images, device).cpu(), expected)
 
 

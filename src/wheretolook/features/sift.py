@@ -30,9 +30,7 @@ class OpenCvSift:
             self._extract = lambda images: on_gpu.extract_many(grey_images(images, on_gpu.device))
 
     def extract_batch(self, images: Sequence[NDArray[np.uint8]]) -> list[Keypoints]:
-        """Keypoints of images (H, W, 3) uint8 of one size, those of most contrast first."""
-        for rgb in images:
-            check_image(rgb)
+        """Keypoints of images (H, W, 3) uint8 of one size, of which a GPU may have tensors, those of most contrast first."""
         return self._extract(images)
 
 

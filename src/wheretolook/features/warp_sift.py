@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from wheretolook.features import warp_sift_kernels as kernels
-from wheretolook.features.extractor import ExtractorConfig, Keypoints
+from wheretolook.features.extractor import ExtractorConfig, Keypoints, check_image
 from wheretolook.features.warp_sift_kernels import BORDER, LAYERS, LEVELS, MAX_SIDE
 from wheretolook.utils.warp import Staging, start_warp
 
@@ -147,9 +147,15 @@ class WarpSift:
         return buffer
 
 
-def grey_images(images: Sequence[NDArray[np.uint8]], device: str) -> Tensor:
+def grey_images(images: Sequence[NDArray[np.uint8]] | Sequence[Tensor], device: str) -> Tensor:
     """Convert images (H, W, 3) uint8 of one size to grey (B, H, W) uint8 on a device, exactly as `sift.grey_bitmap`."""
-    red, green, blue = torch.from_numpy(np.asarray(images)).to(device).unbind(-1)
+    if isinstance(images[0], Tensor):
+        rgb = torch.stack([*images])
+    else:
+        for image in images:
+            check_image(image)
+        rgb = torch.from_numpy(np.asarray(images))
+    red, green, blue = rgb.to(device).unbind(-1)
     grey = (red * 0.2126 + green * 0.7152 + blue * 0.0722 + 0.5).byte()
     if grey.is_cuda:
         torch.cuda.current_stream(grey.device).synchronize()  # Warp reads it in another stream

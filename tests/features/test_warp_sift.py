@@ -2,12 +2,14 @@
 
 import numpy as np
 import pytest
+import torch
 import warp as wp
 from scipy.spatial import KDTree
 
 from features.textures import texture
 from wheretolook.features.extractor import ExtractorConfig, KeypointExtractor
-from wheretolook.features.warp_sift import WarpSift
+from wheretolook.features.sift import grey_bitmap
+from wheretolook.features.warp_sift import WarpSift, grey_images
 
 EVERYTHING = ExtractorConfig(max_keypoints=100_000)
 
@@ -72,6 +74,13 @@ def test_an_image_gives_the_same_bits_in_any_batch_and_every_time(device):
     small_blocks = WarpSift(EVERYTHING, device, block_bytes=3 * 100 * 120 * 4 * 6 * 6)
     assert_same(small_blocks.extract_many(images), alone)
     assert small_blocks._space.n_images < len(images)
+
+
+def test_grey_images_are_those_of_colmap(device):
+    images = np.random.default_rng(0).integers(0, 256, (3, 97, 101, 3), dtype=np.uint8)
+    expected = [grey_bitmap(rgb).to_array() for rgb in images]
+    for of_images in (images, list(images), list(torch.tensor(images, device=device))):
+        np.testing.assert_array_equal(grey_images(of_images, device).cpu(), expected)
 
 
 def test_more_extrema_than_the_list_holds(device):

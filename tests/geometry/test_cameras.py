@@ -72,12 +72,13 @@ def test_invalid_cameras(options):
         _ = CameraConfig(**options).camera
 
 
-def test_drawn_cameras_span_common_sizes_and_angles(rng):
-    drawn = [draw_camera(rng) for _ in range(400)]
+@pytest.mark.parametrize(("any_lens", "narrowest_deg", "largest_px"), [(False, 40, 1280), (True, 25, 2000)])
+def test_drawn_cameras_span_sizes_and_angles(any_lens, narrowest_deg, largest_px, rng):
+    drawn = [draw_camera(rng, any_lens) for _ in range(400)]
     longer = np.array([max(camera.width, camera.height) for camera in drawn])
     angle = 2 * np.degrees(np.arctan(longer / 2 / [camera.fx for camera in drawn]))
-    assert 320 <= longer.min() < 340 and 1200 < longer.max() <= 1280
-    assert 40 - 0.1 < angle.min() < 43 and 117 < angle.max() < 120.1
+    assert 320 <= longer.min() < 340 and 0.93 * largest_px < longer.max() <= largest_px
+    assert narrowest_deg - 0.1 < angle.min() < narrowest_deg + 3 and 117 < angle.max() < 120.1
     assert any(camera.height > camera.width for camera in drawn)
 
 

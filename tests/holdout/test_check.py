@@ -171,7 +171,8 @@ def test_adapted_weights_are_checked_on_their_own_map_alone(checked, corridor, t
     source = open_map(*corridor, frame=FrameOptions(scale=1))
     base = TrainedNetwork.load(WEIGHTS / "set.safetensors", SetNetwork, "set")
     base = for_map(base, whole_map(source, HiddenPointRemoval(), "cpu"))  # as `adapt` writes it
-    network = AdaptedNetwork(base.network, base.scale, base.offset, 256, base.error_scale)  # changes no score
+    assert base.of_map is not None
+    network = AdaptedNetwork(base.network, base.scale, base.offset, 256, base.of_map.error_scale)  # changes no score
     points = np.array([point.xyz for _, point in sorted(read_model(corridor[0]).points3D.items())])
     path = tmp_path / "adapted.safetensors"
     arguments = [*_arguments(*corridor, tmp_path / "out", "--scale", "1"), "--weights", str(path)]

@@ -87,15 +87,42 @@ def test_three_points_that_determine_no_pose_have_no_solution(shape, device):
     assert np.isinf(costs).all()
 
 
+def refined(points, keypoints, poses, steps, device):
+    """Refine poses (V, S, 3, 4) on points (V, 1 or S, M, 3) at keypoints: poses and costs (V, S)."""
+    arrays = (torch.tensor(values, device=device) for values in (points, keypoints))
+    found = MatchBatch(*arrays, (FOCAL, FOCAL)).refine(torch.tensor(poses, device=device), 1 / 8, steps)
+    return [values.cpu().numpy() for values in found]
+
+
+@pytest.mark.parametrize("shared", [True, False])
+def test_refinement_is_that_of_the_twin(shared, device):
+    """Several hypotheses with the same matches or each with its own, of which some are wrong, behind or missing."""
+    rng = np.random.default_rng(6)
+    poses, points, keypoints = exact_matches(20, 100, seed=7)
+    keypoints += rng.normal(0, 0.1 / FOCAL, keypoints.shape)
+    keypoints[:, :20] = rng.uniform(-1, 1, (20, 20, 2))
+    points[:, 20:30] = -points[:, 20:30]
+    keypoints[:, 30:35] = 1e6
+    starts = np.stack([poses, poses, poses], 1)
+    starts[..., 3] += rng.normal(0, 0.01, (20, 3, 3))
+    starts[0, 1] = np.nan
+    points, keypoints = (np.stack([x] if shared else [x, x[:, ::-1], x], 1) for x in (points, keypoints))
+    found, costs = refined(points, keypoints, starts, 5, device)
+    assert np.isnan(found[0, 1]).all() and np.isinf(costs[0, 1])
+    for view, n in np.argwhere(np.isfinite(costs)):
+        matched = 0 if shared else n
+        pose, cost = twin.refine(starts[view, n], points[view, matched], keypoints[view, matched], FOCAL, 1 / 8, 5)
+        assert_allclose(found[view, n], pose, atol=1e-9)
+        assert_allclose(costs[view, n], cost, rtol=1e-9)
+
+
 def test_refinement_finds_the_minimum(device):
     """Against SciPy with the same loss, on matches of which none is an outlier."""
     poses, points, keypoints = exact_matches(1, 20, seed=4)
     keypoints += np.random.default_rng(5).normal(0, 0.04 / FOCAL, keypoints.shape)
     start = poses.copy()
     start[:, :, 3] += 0.02
-    arrays = (torch.tensor(values[:, None], device=device) for values in (points, keypoints))
-    matches = MatchBatch(*arrays, torch.full((2,), FOCAL, dtype=torch.float64, device=device))
-    found = matches.refine(torch.tensor(start[:, None], device=device), 1 / 8, 25)[0][:, 0].cpu().numpy()
+    found = refined(points[:, None], keypoints[:, None], start[:, None], 25, device)[0][:, 0]
 
     for pose, true, of_view, at in zip(found, poses, points, keypoints, strict=True):
 

@@ -9,13 +9,13 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.mesh import TexturedMesh
-from wheretolook.geometry.poses import poses_looking_along
+from wheretolook.geometry.poses import pose_error, poses_looking_along
 from wheretolook.mapping import triangulation
 from wheretolook.mapping.colmap_model import colmap_poses
 from wheretolook.mapping.config import MIN_TRIANGULATION_ANGLE_DEG, MapConfig
 from wheretolook.mapping.landmarks import Landmarks, load_colmap_landmarks
 from wheretolook.mapping.rendered_map import build_map, plan_walk
-from wheretolook.mapping.triangulation import choose_pairs, shrink_depth, surface_overlap
+from wheretolook.mapping.triangulation import choose_pairs, estimate_poses, shrink_depth, surface_overlap
 from wheretolook.rendering.appearance import Appearance
 from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.utils.errors import MapError
@@ -87,6 +87,30 @@ def test_a_varied_map_with_appearance_is_of_fewer_and_changed_images(built, room
         assert np.abs(image.astype(int) - expected).mean() < 0.1
         changes.append(np.abs(image.astype(int) - rendering.rgb[0]).mean())
     assert min(changes) > 0.5 and max(changes) > 10
+
+
+def test_noisy_poses_are_adjusted_to_those_of_the_walk(built, rng):
+    model = pycolmap.Reconstruction(str(built[0]))
+    exact = {number: image.cam_from_world().matrix() for number, image in model.images.items()}
+    for number, image in model.images.items():
+        turned = pycolmap.Rotation3d(rng.normal(0, 0.005, 3)) * pycolmap.Rotation3d(exact[number][:, :3])
+        image.frame.set_cam_from_world(1, pycolmap.Rigid3d(turned, exact[number][:, 3] + rng.normal(0, 0.02, 3)))
+    estimate_poses(model)
+    errors_m = [
+        pose_error(image.cam_from_world().matrix(), exact[number])[0]
+        for number, image in model.images.items()
+        if image.num_points3D > 20
+    ]
+    assert np.median(errors_m) < 0.02
+
+
+def test_a_drifting_map_has_an_estimated_camera(room, room_free_space, renderer, tmp_path):
+    folder = tmp_path / "map"
+    config = MapConfig(n_images=10, vary="drift")
+    report = build_map(room, renderer, room_free_space, CAMERA, config, SEED, folder, workers=1, progress=False)
+    (camera,) = pycolmap.Reconstruction(str(folder)).cameras.values()
+    assert 1e-5 < abs(camera.focal_length / CAMERA.fx - 1) < 0.05
+    assert report.median_distance_to_mesh_cm < 5
 
 
 def test_landmarks_project_to_their_keypoints(built):

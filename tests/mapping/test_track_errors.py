@@ -13,9 +13,9 @@ from wheretolook.mapping.track_errors import log_error_ratio
 CAMERA = PinholeCamera(640, 480, 500.0)
 
 
-def observed(noise_px: float, n_images: int = 24, n_points: int = 1500) -> ModelArrays:
+def observed(noise_px: float, n_images: int = 24, n_points: int = 1500, seed: int = 0) -> ModelArrays:
     """Points before a row of cameras, at their true places, observed with normal noise."""
-    rng = np.random.default_rng(0)
+    rng = np.random.default_rng(seed)
     points = rng.uniform((-4, 3, -1.5), (4, 6, 1.5), (n_points, 3))
     centers = np.column_stack([np.linspace(-3, 3, n_images), rng.normal(0, 0.2, (n_images, 2))])
     poses = poses_looking_along(centers, np.tile([0.0, 1.0, 0.0], (n_images, 1)))
@@ -44,12 +44,18 @@ def observed(noise_px: float, n_images: int = 24, n_points: int = 1500) -> Model
 @pytest.mark.parametrize("noise_px", [0.1, 1.0])
 def test_independent_noise_has_the_expected_errors(noise_px):
     # the norm of a normal vector over its root mean square has the median 0.89 in three equal axes, less in unequal ones
-    assert np.exp(log_error_ratio(observed(noise_px), {1: CAMERA}, noise_px)) == pytest.approx(0.85, abs=0.2)
+    assert np.exp(log_error_ratio(observed(noise_px), {1: CAMERA}, noise_px)[0]) == pytest.approx(0.85, abs=0.2)
 
 
 def test_errors_scale_with_noise_that_is_larger_than_stated():
-    exact = log_error_ratio(observed(0.5), {1: CAMERA}, 0.5)
-    assert log_error_ratio(observed(0.5), {1: CAMERA}, 0.25) == pytest.approx(exact + np.log(2), abs=0.25)
+    exact, _ = log_error_ratio(observed(0.5), {1: CAMERA}, 0.5)
+    assert log_error_ratio(observed(0.5), {1: CAMERA}, 0.25)[0] == pytest.approx(exact + np.log(2), abs=0.25)
+
+
+def test_its_standard_error_is_its_deviation_between_draws_of_the_noise():
+    drawn = [log_error_ratio(observed(0.3, seed=seed), {1: CAMERA}, 0.2) for seed in range(6)]
+    ratios, errors = np.transpose(drawn)
+    assert errors.mean() == pytest.approx(ratios.std(ddof=1), rel=0.5)
 
 
 def test_errors_that_landmarks_of_an_image_share_are_found():
@@ -59,7 +65,7 @@ def test_errors_that_landmarks_of_an_image_share_are_found():
     shifted = replace(
         images, observation_pixels=images.observation_pixels + shift[images.observation_image].astype("f4")
     )
-    alone, together = (log_error_ratio(one, {1: CAMERA}, 0.3) for one in (images, shifted))
+    alone, together = (log_error_ratio(one, {1: CAMERA}, 0.3)[0] for one in (images, shifted))
     assert together > alone + 1
 
 
@@ -76,8 +82,8 @@ def test_keypoints_without_a_ray_are_left_out_and_exact_ones_are_bounded():
     images = observed(0.3)
     pixels = images.observation_pixels.copy()
     pixels[::50] = np.nan
-    expected = log_error_ratio(images, {1: CAMERA}, 0.3)
-    assert log_error_ratio(replace(images, observation_pixels=pixels), {1: CAMERA}, 0.3) == pytest.approx(
+    expected, _ = log_error_ratio(images, {1: CAMERA}, 0.3)
+    assert log_error_ratio(replace(images, observation_pixels=pixels), {1: CAMERA}, 0.3)[0] == pytest.approx(
         expected, abs=0.2
     )
-    assert log_error_ratio(observed(1e-9), {1: CAMERA}, 0.3) == -0.5
+    assert log_error_ratio(observed(1e-9), {1: CAMERA}, 0.3)[0] == -0.5

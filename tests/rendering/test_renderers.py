@@ -114,8 +114,10 @@ def test_blocks_do_not_change_the_images(device):
     camera = PinholeCamera(40, 30, 30.0)
     poses = poses_looking_along(np.zeros((5, 3)), np.random.default_rng(0).normal(size=(5, 3)))
     whole = WarpRenderer(mesh, device).render(camera, poses)
-    blocks = WarpRenderer(mesh, device, block_bytes=2 * 40 * 30 * 7).render(camera, poses)
+    renderer = WarpRenderer(mesh, device, block_bytes=2 * 40 * 30 * 7)
+    blocks = renderer.render(camera, poses)
     assert_array_equal(whole.rgb, blocks.rgb)
+    assert_array_equal(whole.rgb, np.concatenate([colors.numpy() for colors in renderer.colors(camera, poses)]))
     assert_array_equal(whole.depth_m, blocks.depth_m)
     assert WarpRenderer(mesh).render(camera, poses[:0]).rgb.shape == (0, 30, 40, 3)
 

@@ -1,5 +1,6 @@
 """The offset of the log-odds of detection that a map's own images determine."""
 
+import json
 from copy import deepcopy
 from dataclasses import replace
 
@@ -101,18 +102,22 @@ def with_images(localization_map, images):
 def test_the_offset_is_that_of_the_rate_of_detection(p_detect):
     """Whether a held-out image observes a landmark is independent of the others, so that the rate is known."""
     expected = logit(p_detect) - logit(PREDICTED)
-    assert detection_offset(constant_network(), observed_map(p_detect)) == pytest.approx(expected, abs=0.12)
+    localization_map = observed_map(p_detect)
+    offset, error = detection_offset(constant_network(), localization_map)
+    assert offset == pytest.approx(expected, abs=0.12)
+    n_observed = 0.4 * len(localization_map.map.images.observation_image)  # in 16 of 40 images
+    assert error == pytest.approx(1 / np.sqrt(n_observed * (1 - p_detect)), rel=0.4)  # of a binomial's log-odds
 
 
 def test_the_offset_is_bounded():
-    assert detection_offset(constant_network(), observed_map(0.06, n=10_000)) == OFFSETS[0]
-    assert detection_offset(constant_network(), observed_map(0.97)) == OFFSETS[-1]
+    assert detection_offset(constant_network(), observed_map(0.06, n=10_000))[0] == OFFSETS[0]
+    assert detection_offset(constant_network(), observed_map(0.97))[0] == OFFSETS[-1]
 
 
 def test_few_images_do_not_determine_it():
-    assert detection_offset(constant_network(), observed_map(0.6, n_images=4)) == 0
-    assert detection_offset(constant_network(), observed_map(0.6, n=3)) == 0
-    assert detection_offset(constant_network(), with_images(observed_map(0.6), None)) == 0
+    assert detection_offset(constant_network(), observed_map(0.6, n_images=4)) == (0, None)
+    assert detection_offset(constant_network(), observed_map(0.6, n=3)) == (0, None)
+    assert detection_offset(constant_network(), with_images(observed_map(0.6), None)) == (0, None)
 
 
 def test_maps_that_do_not_show_it():
@@ -131,7 +136,7 @@ def test_maps_that_do_not_show_it():
         observation_image=np.tile([0, 1], n),
         observation_keypoint=np.zeros(2 * n, dtype=np.int64),
     )
-    assert detection_offset(constant_network(), with_images(localization_map, pairs)) == 0
+    assert detection_offset(constant_network(), with_images(localization_map, pairs)) == (0, None)
 
 
 def test_every_occlusion_model_has_its_own():
@@ -147,13 +152,15 @@ def test_it_is_added_for_photographs_only_and_to_a_copy():
     assert for_map(trained, observed_map(0.6, photographs=False)) is trained
     localization_map = observed_map(0.6)
     calibrated = for_map(trained, localization_map)
-    assert calibrated.error_scale == pytest.approx(max(0.1, localization_map.landmarks.keypoint_noise_px))
+    noise_px = max(0.1, localization_map.landmarks.keypoint_noise_px)
+    assert calibrated.of_map.error_scale == pytest.approx(noise_px)
+    assert calibrated.of_map.log_error_scale_error is None  # without keypoints
     landmarks = replace(
         localization_map.landmarks, reprojection_error_px=np.full(len(localization_map.landmarks), np.nan)
     )
     unknown = replace(localization_map, map=replace(localization_map.map, landmarks=landmarks))
     with pytest.warns(MapWarning, match="reprojection error"):
-        assert for_map(trained, unknown).error_scale == pytest.approx(1.0)
+        assert for_map(trained, unknown).of_map.error_scale == pytest.approx(1.0)
     values = torch.zeros(5, len(trained.network.attributes))
     before, after = (one.network.matchability(values).sigmoid().numpy() for one in (trained, calibrated))
     assert_allclose(before, PREDICTED, rtol=1e-5)
@@ -176,6 +183,11 @@ def test_all_scorers_of_a_map_use_it(tmp_path):
     assert_allclose(scorer.score_directions(center, axes)[0], expected, atol=0.02)
     folder = export_robot(localization_map, WEIGHTS / "set.safetensors", tmp_path, progress=False)
     assert_allclose(RobotScorer(folder).score(views), scorer.score(views), atol=1e-5)
+    calibration = json.loads((folder / "robot.json").read_text())["calibration"]
+    report = replace(scorer.report(views[:1]), waypoint_id=("a",), rank=np.ones(1, dtype=np.int64))
+    report.in_frame(localization_map.frame).save(tmp_path / "views.json")
+    assert json.loads((tmp_path / "views.json").read_text())["calibration"] == calibration
+    assert calibration["detection_offset"] == scorer.trained.of_map.detection_offset
 
 
 def test_landmarks_without_an_image_are_those_of_the_smaller_model(tmp_path):

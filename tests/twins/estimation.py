@@ -1,4 +1,4 @@
-"""Plain version of P3P: Grunert's quartic (Haralick et al., IJCV 1994), and scores one match after the other."""
+"""Plain P3P by Grunert's quartic (Haralick et al., IJCV 1994), scores one match after the other, and refinement."""
 
 import numpy as np
 
@@ -47,3 +47,27 @@ def msac(pose, points, keypoints, focal):
         error = (np.array([x / z, y / z]) - keypoint) * focal
         cost += min(error @ error, 1.0) if z > 0 else 1.0
     return cost
+
+
+def refine(pose, points, keypoints, focal, scale, steps):
+    """Best pose (3, 4) of so many Gauss-Newton steps with Cauchy weights on the inliers, and its cost; see `msac`."""
+    best, least = pose, np.inf
+    for _ in range(steps):
+        in_camera = points @ pose[:, :3].T + pose[:, 3]
+        x, y, z = in_camera.T
+        error = (in_camera[:, :2] / z[:, None] - keypoints) * focal
+        squared = np.where(z > 1e-6, (error**2).sum(1), np.inf)
+        relative = 1 + np.minimum(squared, 1) / scale**2
+        cost = np.log(relative).sum()
+        if cost < least:
+            best, least = pose, cost
+        none = np.zeros(len(points))
+        by_point = focal * np.stack([1 / z, none, -x / z**2, none, 1 / z, -y / z**2], 1).reshape(-1, 2, 3)
+        jacobian = np.concatenate([np.cross(in_camera[:, None], by_point), by_point], 2)[squared < 1].reshape(-1, 6)
+        weight = np.repeat(1 / relative[squared < 1], 2)
+        normal = (jacobian.T * weight) @ jacobian
+        change = np.linalg.solve(normal, (jacobian.T * weight) @ error[squared < 1].ravel())
+        half = np.cross(np.eye(3), change[:3]) / 2
+        pose = np.linalg.solve(np.eye(3) + half, np.eye(3) - half) @ pose  # Cayley's rotation
+        pose[:, 3] -= change[3:]
+    return best, least

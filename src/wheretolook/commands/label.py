@@ -34,7 +34,6 @@ from wheretolook.tracking import TrackingConfig, check_store, kept_if_not_logged
 from wheretolook.utils.errors import MapError, SceneError, TableError
 from wheretolook.utils.files import cache_key, read_json_object, write_json, write_text
 from wheretolook.utils.package import reports
-from wheretolook.utils.processes import cores
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -92,15 +91,6 @@ class Label(LabelOptions):
         seconds = self._label(to_label, summary, log, progress) if to_label else {}
         if to_log:
             log_labels(dataset, self.tracking, seconds)
-        if to_label:
-            wall = seconds.pop("wall")
-            total = sum(seconds.values()) or 1.0
-            workers = self.label.workers or cores()
-            times = ", ".join(
-                f"{step} {spent:.1f} ({spent / total:.0%}, alone {spent / workers:.1f})"
-                for step, spent in seconds.items()
-            )
-            log(f"seconds over workers (share, wall time of this step alone): {times}; wall {wall:.1f}")
         return dataset
 
     def _key(self, files: SceneFolder) -> str:
@@ -116,7 +106,7 @@ class Label(LabelOptions):
     ) -> dict[str, float]:
         """Label scenes and store their keys. Returns the seconds that each step took."""
         from wheretolook.dataset.viewpoint_files import write_table
-        from wheretolook.localization.labeller import LabelTask, label_scenes
+        from wheretolook.localization.labeller import LabelTask, label_scenes, processes_of
 
         config = self.label
         scenes = {files.name: files for files in to_label}
@@ -145,7 +135,14 @@ class Label(LabelOptions):
                 seconds.update(labelled.seconds)  # type: ignore[call-overload]
                 _report(files, labelled.table, log)
                 progress(1)
-        return {**seconds, "wall": time.monotonic() - start}
+        wall = time.monotonic() - start
+        total = sum(seconds.values()) or 1.0
+        workers = config.workers or processes_of(tasks[0].job)
+        times = ", ".join(
+            f"{step} {spent:.1f} ({spent / total:.0%}, alone {spent / workers:.1f})" for step, spent in seconds.items()
+        )
+        log(f"seconds over workers (share, wall time of this step alone): {times}; wall {wall:.1f}")
+        return {**seconds, "wall": wall}
 
 
 def _shards(files: SceneFolder) -> Path:

@@ -230,7 +230,7 @@ def _map_mesh(options: BuildMap, files: SceneFolder, log: Log) -> None:
 def _mapping_camera(config: MapConfig, looking: Camera, seed: int) -> PinholeCamera:
     """Return the camera that maps: from the options, drawn, or the scene's. Raises ConfigError if it has distortion."""
     if config.draw_camera:
-        return draw_camera(np.random.default_rng([seed, 1]))
+        return draw_camera(np.random.default_rng([seed, 1]), any_lens=config.vary == "drift")
     camera = looking if config.camera is None else config.camera.camera
     if not isinstance(camera, PinholeCamera):
         fix = "Give one without distortion: --mapping.camera '{width: 640, height: 480, fov_deg: 90}'."

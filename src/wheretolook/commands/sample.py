@@ -64,7 +64,7 @@ def _key(scene: Scene, config: SampleConfig) -> str:
         space = asdict(scene.mapped_space_config)
         stage = "map"
     chosen = {name: value for name, value in asdict(config).items() if name != "memory_gb"}
-    for name in ("cameras", "near_map"):
+    for name in ("cameras", "near_map", "any_lens"):
         if not chosen[name]:  # keys of datasets that were sampled before this option existed
             del chosen[name]
     chosen["max_directions"] = config.directions_of(files.split)
@@ -78,7 +78,7 @@ def _cameras(scene: Scene, config: SampleConfig) -> Camera | dict[int, Camera]:
     if not config.cameras:
         return scene.camera
     rng = np.random.default_rng([config.seed, zlib.crc32(scene.name.encode())])
-    return {number: draw_camera(rng) for number in range(1, config.cameras + 1)}
+    return {number: draw_camera(rng, config.any_lens) for number in range(1, config.cameras + 1)}
 
 
 def _sample(scene: Scene, config: SampleConfig, log: Log) -> None:

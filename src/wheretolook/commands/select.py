@@ -165,6 +165,8 @@ def finish(command: SelectorOptions, selector: WhereToLook, views: Views, given:
     features = localization_map.landmarks.features or "no descriptors"
     landmarks = f"{len(localization_map.landmarks):,} landmarks ({features})"
     print(f"{landmarks}, occlusion: {localization_map.occlusion.name}, method: {views.method}")
+    if views.of_map is not None:
+        print(views.of_map.describe())
     best = views.rank == 1
     kind, scores = ("best scores", views.score) if views.set_score is None else ("set scores", views.set_score)
     print(f"{locations}: {n_used}{skipped}; {kind} {scores[best].min():.3g} to {scores[best].max():.3g}")

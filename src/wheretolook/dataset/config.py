@@ -85,6 +85,7 @@ class SampleConfig(ViewLattice):
         seed: seed of what is drawn at random.
         cameras: number of cameras of a scene, each used at its own locations, with fields of view, sizes and aspect
             ratios drawn from the scene's seed; 0 uses the experiment's camera everywhere.
+        any_lens: draw these from 25 to 120 degrees and 320 to 2,000 px, in place of 40 to 120 and 320 to 1,280.
         near_map: share of `max_locations`, 0 to 1, that is near mapping images, with directions near theirs, as
             photographs of a sequence are to each other; needs a grid of about 20 cm.
 
@@ -100,6 +101,7 @@ class SampleConfig(ViewLattice):
     max_directions: int | dict[Split, int] = 0
     seed: int = 0
     cameras: int = 0
+    any_lens: bool = False
     near_map: float = 0.0
     distinct_pixels: bool = field(default=False, init=False)
     memory_gb: float = field(default=2.0, init=False)

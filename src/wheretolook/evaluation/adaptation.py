@@ -146,7 +146,8 @@ def save_adapted(
     points = whole.landmarks.points
     # the scene is recognized by as many landmarks
     n_signature = min(256, len(points))
-    network = AdaptedNetwork(base.network, base.scale, base.offset, n_signature, base.error_scale)
+    error_scale = None if base.of_map is None else base.of_map.error_scale
+    network = AdaptedNetwork(base.network, base.scale, base.offset, n_signature, error_scale)
     network.place[:] = torch.from_numpy(points[np.arange(n_signature) * len(points) // max(1, n_signature)])
     trained = TrainedNetwork("adapted", network, base.camera, adapted.scale, adapted.offset, base.training_range)
     about = {**about, "weights_sha256": fingerprint(weights)}

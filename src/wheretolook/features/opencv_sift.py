@@ -22,10 +22,6 @@ class RootSift:
             0, 3, 3 * config.peak_threshold, config.edge_threshold, 1.6, enable_precise_upscale=True
         )
 
-    def extract_many(self, grey: NDArray[np.uint8]) -> list[Keypoints]:
-        """Extract the keypoints of each image (B, H, W) uint8."""
-        return [self.extract(one) for one in grey]
-
     def extract(self, grey: NDArray[np.uint8]) -> Keypoints:
         """Extract the keypoints of an image (H, W) uint8, those of most contrast first."""
         keypoints, descriptors = self._sift.detectAndCompute(np.ascontiguousarray(grey), None)

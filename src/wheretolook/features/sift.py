@@ -18,18 +18,20 @@ class OpenCvSift:
     """OpenCV's SIFT on one CPU core; on a CUDA device by Warp kernels."""
 
     def __init__(self, config: ExtractorConfig, device: str) -> None:
+        self.batch = 1 if device == "cpu" else 8
+        self._extract: Callable[[Sequence[NDArray[np.uint8]]], list[Keypoints]]
         if device == "cpu":
-            self.batch = 1
-            self._extract: Callable[[NDArray[np.uint8]], list[Keypoints]] = RootSift(config).extract_many
+            sift = RootSift(config)
+            self._extract = lambda images: [sift.extract(grey_bitmap(rgb).to_array()) for rgb in images]
         else:
-            from wheretolook.features.warp_sift import WarpSift
+            from wheretolook.features.warp_sift import WarpSift, grey_images
 
-            self.batch = 8
-            self._extract = WarpSift(config, device).extract_many
+            on_gpu = WarpSift(config, device)
+            self._extract = lambda images: on_gpu.extract_many(grey_images(images, on_gpu.device))
 
     def extract_batch(self, images: Sequence[NDArray[np.uint8]]) -> list[Keypoints]:
-        """Keypoints of images (H, W, 3) uint8 of one size, those of most contrast first."""
-        return self._extract(np.stack([grey_bitmap(rgb).to_array() for rgb in images]))
+        """Keypoints of images (H, W, 3) uint8 of one size, of which a GPU may have tensors, those of most contrast first."""
+        return self._extract(images)
 
 
 class ColmapSift:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any
 
@@ -10,9 +11,10 @@ import numpy as np
 import torch
 import warp as wp
 from numpy.typing import NDArray
+from torch import Tensor
 
 from wheretolook.features import warp_sift_kernels as kernels
-from wheretolook.features.extractor import ExtractorConfig, Keypoints
+from wheretolook.features.extractor import ExtractorConfig, Keypoints, check_image
 from wheretolook.features.warp_sift_kernels import BORDER, LAYERS, LEVELS, MAX_SIDE
 from wheretolook.utils.warp import Staging, start_warp
 
@@ -41,15 +43,16 @@ class WarpSift:
         self._buffers: dict[str, Any] = {}
         self._staging = Staging()
 
-    def extract_many(self, grey: NDArray[np.uint8]) -> list[Keypoints]:
+    def extract_many(self, images: NDArray[np.uint8] | Tensor) -> list[Keypoints]:
         """At most `max_keypoints` keypoints of each grey image (B, H, W) uint8, those of most contrast first.
 
         Raises ValueError if the images are too large.
         """
+        grey = torch.as_tensor(images)
         n_images, rows, columns = grey.shape
         size = values_of_image(rows, columns)
         if 2 * max(rows, columns) > MAX_SIDE or size >= 1 << 31:
-            raise ValueError(f"expected images of at most {MAX_SIDE // 2} pixels a side, got {grey.shape}")
+            raise ValueError(f"expected images of at most {MAX_SIDE // 2} pixels a side, got {tuple(grey.shape)}")
         if n_images == 0 or min(rows, columns) <= BORDER:
             return [Keypoints.none() for _ in range(n_images)]
         # kernels index the values of a block with 31 bits
@@ -63,7 +66,7 @@ class WarpSift:
             keypoints += self._extract_block(space, grey[start : start + space.n_images])
         return keypoints
 
-    def _extract_block(self, space: ScaleSpace, grey: NDArray[np.uint8]) -> list[Keypoints]:
+    def _extract_block(self, space: ScaleSpace, grey: Tensor) -> list[Keypoints]:
         n_images = grey.shape[0]
         space.fill(grey)
         keys = space.find()
@@ -144,6 +147,21 @@ class WarpSift:
         return buffer
 
 
+def grey_images(images: Sequence[NDArray[np.uint8]] | Sequence[Tensor], device: str) -> Tensor:
+    """Convert images (H, W, 3) uint8 of one size to grey (B, H, W) uint8 on a device, exactly as `sift.grey_bitmap`."""
+    if isinstance(images[0], Tensor):
+        rgb = torch.stack([*images])
+    else:
+        for image in images:
+            check_image(image)
+        rgb = torch.from_numpy(np.asarray(images))
+    red, green, blue = rgb.to(device).unbind(-1)
+    grey = (red * 0.2126 + green * 0.7152 + blue * 0.0722 + 0.5).byte()
+    if grey.is_cuda:
+        torch.cuda.current_stream(grey.device).synchronize()  # Warp reads it in another stream
+    return grey
+
+
 def _by_response(
     image: NDArray[np.int64], table: NDArray[np.float32], angle: NDArray[np.float32], device: str
 ) -> NDArray[np.intp]:
@@ -193,10 +211,9 @@ class ScaleSpace:
         self.weights: Any = wp.array(np.concatenate(filters).astype(np.float32), dtype=wp.float32, device=device)
         self._commands = self._record()
 
-    def fill(self, grey: NDArray[np.uint8]) -> None:
+    def fill(self, grey: Tensor) -> None:
         """Compute the scale spaces of images (B, H, W) uint8, B at most `n_images`."""
-        host: Any = wp.array(np.ascontiguousarray(grey), dtype=wp.uint8, device="cpu", copy=False)
-        wp.copy(self.grey, host, count=grey.size)
+        wp.copy(self.grey, wp.from_torch(grey.contiguous()), count=grey.numel())
         if grey.shape[0] != self.filled:
             self.filled = grey.shape[0]
             for command, size in self._commands:

@@ -412,16 +412,17 @@ def field_of_view_deg(camera: Camera) -> tuple[float, float]:
     return float(angles[0] + angles[1]), float(angles[2] + angles[3])
 
 
-def draw_camera(rng: np.random.Generator) -> PinholeCamera:
+def draw_camera(rng: np.random.Generator, any_lens: bool = False) -> PinholeCamera:
     """Draw a common pinhole: 40 to 120 degrees along the longer side, 320 to 1,280 px wide or high.
 
-    Sides are 4:3, 3:2, 16:9 or 1:1, also upright; the principal point is off the centre by up to 5 % of a side.
+    With `any_lens`, 25 to 120 degrees and 320 to 2,000 px. Sides are 4:3, 3:2, 16:9 or 1:1, also upright; the principal
+    point is off the centre by up to 5 % of a side.
     """
-    longer = np.exp(rng.uniform(*np.log((320, 1280))))
+    longer = np.exp(rng.uniform(*np.log((320, 2000 if any_lens else 1280))))
     proportions = ((4, 3), (3, 2), (16, 9), (1, 1), (3, 4), (2, 3), (9, 16))
     a, b = proportions[rng.integers(len(proportions))]
     width, height = (2 * round(longer * side / max(a, b) / 2) for side in (a, b))
-    across = rng.uniform(40.0, 120.0)
+    across = rng.uniform(25.0 if any_lens else 40.0, 120.0)
     focal_px = round(max(width, height) / 2 / np.tan(np.radians(across) / 2), 2)
     x, y = 0.5 + rng.uniform(-0.05, 0.05, 2)
     center = (round(width * x, 2), round(height * y, 2))

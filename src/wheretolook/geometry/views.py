@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import os
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from io import StringIO
 from itertools import chain
 from pathlib import Path
@@ -86,6 +86,7 @@ class Views:
     camera: Camera | None = None  # of all views; None if they have several
     method: str = ""  # name of the scorer
     frame: Any = None  # `MapFrame` of the map: its unit and direction up, and how they are known
+    of_map: Any = None  # `MapCalibration` of the map of photographs that the scorer is calibrated for
 
     waypoint: Column = None  # (V,) row of the location among those asked for, from 0
     waypoint_id: Column = None  # V names of the locations or of the poses
@@ -325,6 +326,7 @@ def _json_content(views: Views) -> dict[str, Any]:
         "yaw_zero": world_from_map.rotation[0].tolist(),
         "gravity": views.frame.gravity,
         "method": views.method,
+        "calibration": None if views.of_map is None else asdict(views.of_map),
         "camera": None if views.camera is None else views.camera.colmap.record(),
         "views": [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)],
     }

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +26,7 @@ from wheretolook.holdout.scores import VISIBLE, Scoring, check_place, score_view
 from wheretolook.mapping.colmap_model import observation_matrix
 from wheretolook.mapping.georeference import DEPTH_M
 from wheretolook.scorers.registry import is_probability
+from wheretolook.training.trained_network import MapCalibration
 from wheretolook.utils.files import write_json, write_text
 from wheretolook.visibility.hidden_points import HiddenPointRemoval
 from wheretolook.visibility.occlusion import OcclusionModel
@@ -227,10 +228,7 @@ class CheckReport:
             good, every = (_with_interval(ratios[name], 2) for name in ("localized", "all"))
             lines.append(f"inliers over expected: {good} of views that localize, {every} of all")
         if of_map := numbers.get("map"):
-            lines.append(
-                f"keypoint noise of the map {of_map['keypoint_noise_px'] or 1:.2f} px, errors as of "
-                f"{of_map['error_scale']:.2f} px; log-odds of detection {of_map['detection_offset'] or 0:+.2f}"
-            )
+            lines.append(MapCalibration(**of_map).describe())
         if source.fov_deg is not None:
             lines.append(f"views of {source.fov_deg:g} degrees, {source.n_crops} of each photograph")
         if numbers["share_in_range"] < 1:
@@ -286,14 +284,8 @@ def check_map(
     columns[VISIBLE] = columns.pop(VISIBLE)  # the baseline comes last
     centers = (source.own_centers * source.from_model.scale)[scored["row"].to_numpy()]
     numbers = measure(scored, columns, centers, source.place_radius, is_probability(method))
-    known = source.map.computed if source.photographs else {}
-    if "error_scale" in known:
-        offsets = [value for key, value in known.items() if isinstance(key, tuple)]
-        numbers["map"] = {
-            "keypoint_noise_px": source.map.landmarks.keypoint_noise_px,
-            "error_scale": known["error_scale"],
-            "detection_offset": offsets[0] if offsets else None,
-        }
+    if source.photographs and (of_map := source.map.computed.get("calibration")):
+        numbers["map"] = asdict(of_map)
     middle = scored[scored["crop"] == 0]
     parts = weak_parts(source, results, middle)
     photographs = _photographs(source, middle, parts)

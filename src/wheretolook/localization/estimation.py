@@ -501,15 +501,16 @@ class PoseAmbiguity:
         return len(np.unique(cells @ np.array([1, 2**21, 2**42])))
 
 
-def _preferences(unique: NDArray[np.int64], support: ArrayLike) -> Float:
-    """Log odds (K, K) for each pose against each other, from unique support (K, K) and, less so, support (K,)."""
+def preferences(unique: NDArray[np.int64], support: ArrayLike) -> Float:
+    """Log odds (..., K, K) for each pose against each other, from unique support and, less so, support (..., K)."""
     smoothed = np.asarray(support, dtype=np.float64) + 1
-    return log_ratio(unique, unique.T) + 0.2 * np.log(smoothed[:, None] / smoothed)
+    ratio = smoothed[..., :, None] / smoothed[..., None, :]
+    return log_ratio(unique, unique.swapaxes(-1, -2)) + 0.2 * np.log(ratio)
 
 
 def strongest_rival(unique: NDArray[np.int64], support: Sequence[float], k: int) -> int:
     """Index of the pose that is the strongest evidence against pose `k`; `unique` (K, K) as by `unique_supports`."""
-    preference = _preferences(unique, support)[k]
+    preference = preferences(unique, support)[k]
     preference[k] = np.inf
     return int(np.argmin(preference))
 
@@ -520,7 +521,7 @@ def most_likely(unique: NDArray[np.int64], support: Sequence[float]) -> int:
     Pairwise preferences may be cyclic, so poses are not eliminated one after the other.
     """
     candidates = np.flatnonzero(np.asarray(support) >= 0.1 * support[0])
-    preference = _preferences(unique, support)[np.ix_(candidates, candidates)]
+    preference = preferences(unique, support)[np.ix_(candidates, candidates)]
     np.fill_diagonal(preference, np.inf)
     return int(candidates[np.argmax(preference.min(axis=1))])
 

@@ -1,4 +1,4 @@
-"""Warp kernel that computes and scores the poses that three matches of an image determine."""
+"""Warp kernels that compute poses from three matches, refine poses on all, and compare what they explain."""
 
 # mypy: ignore-errors
 # Warp's kernel language is not Python's type system.
@@ -12,6 +12,9 @@ wp.set_module_options({"enable_backward": False, "max_unroll": 1})
 ZERO = wp.constant(wp.float64(0.0))
 ONE = wp.constant(wp.float64(1.0))
 THREE = wp.constant(wp.float64(3.0))
+mat34d = wp.types.matrix(shape=(3, 4), dtype=wp.float64)
+mat77d = wp.types.matrix(shape=(7, 7), dtype=wp.float64)
+vec7d = wp.types.vector(length=7, dtype=wp.float64)
 
 
 @wp.func
@@ -127,3 +130,102 @@ def p3p_kernel(
             costs[view, trial, n] = cost
             turns[view, trial, n] = turn
             shifts[view, trial, n] = shift
+
+
+@wp.func
+def moved(pose: mat34d, point: wp.vec3d) -> wp.vec3d:
+    return pose * wp.vec4d(point[0], point[1], point[2], ONE)
+
+
+@wp.func
+def row(point: wp.vec3d, by_point: wp.vec3d, error: wp.float64) -> vec7d:
+    """Return the derivatives of an error by the rotation and translation of a pose, and the error."""
+    turned = wp.cross(point, by_point)
+    return vec7d(turned[0], turned[1], turned[2], by_point[0], by_point[1], by_point[2], error)
+
+
+@wp.kernel
+def refine_kernel(
+    points: wp.array3d[wp.vec3d],
+    keypoints: wp.array3d[wp.vec2d],
+    focal: wp.vec2d,
+    scale: wp.float64,
+    steps: wp.int32,
+    poses: wp.array2d[mat34d],
+    costs: wp.array2d[wp.float64],
+):
+    """Replace poses by the best of so many Gauss-Newton steps with Cauchy weights, and set their costs, which are infinite.
+
+    A block of threads refines the pose of a view and hypothesis; all hypotheses of a view may share its matches.
+    """
+    view, n, lane = wp.tid()
+    pose = poses[view, n]
+    if wp.isnan(pose[0, 0]):
+        return
+    matched = wp.min(n, points.shape[1] - 1)
+    best = pose
+    least = costs[view, n]
+    for _ in range(steps):
+        normal = mat77d()
+        cost = ZERO
+        for i in range(lane, points.shape[2], wp.block_dim()):
+            point = moved(pose, points[view, matched, i])
+            depth = point[2]
+            error = wp.cw_mul(focal, wp.vec2d(point[0], point[1]) / depth - keypoints[view, matched, i])
+            squared = wp.length_sq(error)
+            if depth > wp.float64(1e-6) and squared < ONE:
+                relative = ONE + squared / (scale * scale)
+                cost += wp.log(relative)
+                by_x = wp.vec3d(focal[0], ZERO, -focal[0] * point[0] / depth) / depth
+                by_y = wp.vec3d(ZERO, focal[1], -focal[1] * point[1] / depth) / depth
+                of_x = row(point, by_x, error[0])
+                of_y = row(point, by_y, error[1])
+                normal += wp.outer(of_x, of_x / relative) + wp.outer(of_y, of_y / relative)
+            else:
+                cost += wp.log(ONE + ONE / (scale * scale))
+        cost = wp.tile_sum(wp.tile(cost))[0]
+        normal = wp.tile_sum(wp.tile(normal, preserve_type=True))[0]
+        if cost < least:
+            least = cost
+            best = pose
+        for k in range(6):  # Gauss's elimination: the matrix is positive definite
+            for below in range(k + 1, 6):
+                normal[below] = normal[below] - normal[k] * (normal[below, k] / normal[k, k])
+        change = vec7d()
+        change[6] = -ONE
+        for upwards in range(6):
+            k = 5 - upwards
+            change[k] = -wp.dot(normal[k], change) / normal[k, k]
+        half = wp.skew(wp.vec3d(change[0], change[1], change[2])) / wp.float64(2.0)
+        identity = wp.identity(n=3, dtype=wp.float64)
+        pose = wp.inverse(identity + half) * (identity - half) * pose  # Cayley's rotation
+        for k in range(3):
+            pose[k, 3] = pose[k, 3] - change[k + 3]
+    if lane == 0:
+        poses[view, n] = best
+        costs[view, n] = least
+
+
+@wp.kernel
+def unexplained_kernel(
+    grid: wp.uint64,
+    landmarks: wp.array[wp.vec3],
+    radius: wp.float32,
+    points: wp.array3d[wp.vec3d],
+    inliers: wp.array3d[wp.bool],
+    poses: wp.array2d[mat34d],
+    unexplained: wp.array4d[wp.bool],
+):
+    """Mark the inliers (V, S, M) of each pose for which another pose (V, S, S, M) shows no landmark within a radius there."""
+    view, n, other, i = wp.tid()
+    theirs = poses[view, other]
+    if n == other or not inliers[view, n, i] or wp.isnan(theirs[0, 0]):
+        return
+    in_camera = moved(poses[view, n], points[view, wp.min(n, points.shape[1] - 1), i])
+    offset = in_camera - wp.vec3d(theirs[0, 3], theirs[1, 3], theirs[2, 3])
+    turned = wp.transpose(theirs) * offset
+    place = wp.vec3(wp.vec3d(turned[0], turned[1], turned[2]))
+    for near in wp.hash_grid_query(grid, place, radius):
+        if wp.length(landmarks[near] - place) < radius:
+            return
+    unexplained[view, n, other, i] = True

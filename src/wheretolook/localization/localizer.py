@@ -93,7 +93,7 @@ class Localizer:
         if extractor is not None:
             self._check_extractor()
         self._device = device
-        self.in_batches = device != "cpu" and config.method == "hypotheses"  # PoseLib finds the first in less time
+        self.in_batches = device != "cpu"
         self._descriptors = landmarks.descriptors
         indexed = self.kind.in_bytes and config.method == "hypotheses" and has_index(len(landmarks), device)
         self._matcher = DescriptorIndex(self._descriptors) if indexed else self._matcher_of(self._descriptors)

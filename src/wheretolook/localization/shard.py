@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 import pandas as pd
 import torch
+import warp as wp
 from numpy.typing import NDArray
 
 from wheretolook.dataset.viewpoint_files import FIRST_FIELDS, MATCH_FIELDS
@@ -26,11 +27,14 @@ from wheretolook.localization.config import LocalizerConfig
 from wheretolook.localization.localizer import Localization, Localizer, localization_errors
 from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.rendering.appearance import Appearance
-from wheretolook.rendering.warp_renderer import Renderer, WarpRenderer
+from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.scenes.loading import load_mesh
 from wheretolook.utils.devices import run_halving
 from wheretolook.utils.errors import WhereToLookError, WorkerError
-from wheretolook.utils.processes import WorkerPool, worker_number
+from wheretolook.utils.processes import WorkerPool, cores, worker_number
+
+GPU_BATCH = 256
+"""Viewpoints of 640 x 480 that a GPU labels at a time: poses take as many launches for one."""
 
 _END = object()
 """Marks the end of the items."""
@@ -130,7 +134,7 @@ class ShardWorker:
         cv2.setNumThreads(1)
         torch.set_num_threads(1)
         self.number = number
-        self._scene: tuple[SceneJob, Localizer, Renderer, Renderer | None] | None = None
+        self._scene: tuple[SceneJob, Localizer, WarpRenderer, WarpRenderer | None] | None = None
 
     def label(self, job: SceneJob, rows: pd.DataFrame) -> LabelledShard:
         """Label viewpoints of a scene.
@@ -149,7 +153,7 @@ class ShardWorker:
             fix = "Fix the cause and run again; finished shards are kept."
             raise WorkerError(problem, path=job.mesh, value=viewpoints, fix=fix) from error
 
-    def _open(self, job: SceneJob) -> tuple[Localizer, Renderer, Renderer | None]:
+    def _open(self, job: SceneJob) -> tuple[Localizer, WarpRenderer, WarpRenderer | None]:
         if self._scene is None or self._scene[0] != job:
             self._scene = None  # free its memory first
             device = job.device
@@ -162,6 +166,15 @@ class ShardWorker:
             localizer = Localizer(landmarks, job.camera, job.localizer, job.extractor, device, map_dir)
             self._scene = job, localizer, renderer, changed
         return self._scene[1:]
+
+
+def processes_of(job: SceneJob) -> int:
+    """Number of processes that label: one for each GPU if all steps run there, otherwise one for each core."""
+    cameras = [job.camera, *(camera for _, camera in job.cameras)]
+    pinholes = all(isinstance(camera, PinholeCamera) for camera in cameras)
+    if job.device == "cpu" or job.extractor.method == "colmap" or not pinholes:
+        return cores()
+    return torch.cuda.device_count() if job.device == "cuda" else 1
 
 
 _worker: ShardWorker | None = None
@@ -186,8 +199,8 @@ def label_rows(
     table: pd.DataFrame,
     job: SceneJob,
     localizer: Localizer,
-    renderer: Renderer,
-    changed: Renderer | None = None,
+    renderer: WarpRenderer,
+    changed: WarpRenderer | None = None,
     seconds: dict[str, float] | None = None,
 ) -> pd.DataFrame:
     """Render viewpoints, localize the images and measure the errors, in batched steps that overlap.
@@ -204,8 +217,7 @@ def label_rows(
     drawn = Appearance.of_views(true_poses, job.appearance, seed) if job.appearance else []
     is_changed = _is_changed(table, seed) if changed else np.zeros(len(table), dtype=bool)
     batches = []
-    # viewpoints of 640 x 480, unless the extractor takes more; poses on a GPU take as long for 8 as for 64
-    batch_size = max(64 if localizer.in_batches else 8, localizer.extractor.batch_of(640, 480))
+    batch_size = max(GPU_BATCH if localizer.in_batches else 8, localizer.extractor.batch_of(640, 480))
     for camera, rows in _by_camera(table, job):
         size = min(batch_size, max(1, batch_size * 640 * 480 // (camera.width * camera.height)))
         shown_in = [(renderer, rows[~is_changed[rows]])]
@@ -251,7 +263,7 @@ def _by_camera(table: pd.DataFrame, job: SceneJob) -> list[tuple[Camera, NDArray
 class _Batch:
     """Some viewpoints that one renderer shows to one camera."""
 
-    renderer: Renderer
+    renderer: WarpRenderer
     camera: Camera
     rows: NDArray[np.int64]  # (B,) of the table
     cam_from_world: Float  # (B, 3, 4)
@@ -265,7 +277,10 @@ class _BatchLabeller:
         self.localizer = localizer
 
     def render(self, batch: _Batch) -> tuple[_Batch, Sequence[NDArray[np.uint8]]]:
-        return batch, run_halving(lambda views: _images(batch, views), np.arange(len(batch.rows)))
+        extractor = self.localizer.extractor
+        on_device = extractor.on_gpu and extractor.config.method == "opencv" and not batch.drawn
+        images = _images_on_device if on_device and isinstance(batch.camera, PinholeCamera) else _images
+        return batch, run_halving(lambda views: images(batch, views), np.arange(len(batch.rows)))
 
     def extract(self, rendered: tuple[_Batch, Sequence[NDArray[np.uint8]]]) -> tuple[_Batch, list[Keypoints]]:
         batch, images = rendered
@@ -278,6 +293,12 @@ class _BatchLabeller:
     def estimate(self, matched: tuple[_Batch, list[Keypoints], list[Matches]]) -> list[Localization]:
         batch, keypoints, matches = matched
         return self.localizer.estimate_batch(keypoints, matches, batch.camera)
+
+
+def _images_on_device(batch: _Batch, views: NDArray[np.int64]) -> list[torch.Tensor]:
+    """Render some views (V,) of a batch as images (H, W, 3) on the device."""
+    colors = batch.renderer.colors(batch.camera, batch.cam_from_world[views])
+    return [image for block in colors for image in wp.to_torch(block)]
 
 
 def _images(batch: _Batch, views: NDArray[np.int64]) -> NDArray[np.uint8]:

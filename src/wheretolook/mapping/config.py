@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, field, fields
 from math import inf
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 from wheretolook.features.extractor import ExtractorConfig
 from wheretolook.geometry.camera import CameraConfig
@@ -287,7 +287,9 @@ class MapConfig:
         draw_camera: draw the mapping camera from the scene's seed, as `sample.cameras` draws query cameras.
         vary: draw from the scene's seed how it is photographed: on a walk through a part of it or all, with even spacing
             or turning on the spot, and with 8 to 100 % of `n_images`. From a few steps, baselines are narrow. Scans
-            ignore it, with a warning.
+            ignore it, with a warning. With "drift", poses and focal length are also estimated, as structure from motion
+            does, in place of exact ones. Images are matched with at least 3 that follow, a number drawn from the scene's
+            seed: baselines are narrow and poses drift where it is small. `draw_camera` then draws as `sample.any_lens`.
         appearance: highest strength, 0 to 1, of what a real camera and people in front of it do to mapping images; see
             `label.appearance`.
         keep_images: keep the rendered images, as `images/` in the map's folder.
@@ -300,7 +302,7 @@ class MapConfig:
     max_reprojection_error_px: float = no_option(0.5)
     camera: CameraConfig | None = None
     draw_camera: bool = False
-    vary: bool = False
+    vary: bool | Literal["drift"] = False
     appearance: float = 0.0
     keep_images: bool = False
     keep_database: bool = False

@@ -21,6 +21,7 @@ from wheretolook.mapping.config import PARTNERS, WALK, MapConfig
 from wheretolook.mapping.map_folder import DATABASE_FILE, MapDraft, MapReport, finish_map, replacing_map
 from wheretolook.mapping.triangulation import (
     choose_pairs,
+    estimate_poses,
     extract_with_colors,
     image_name,
     posed_model,
@@ -273,8 +274,14 @@ def build_map(  # a scene has four parts, and the output and its resources are t
             stored, colors = zip(*extracted, strict=True)
         with clock("pairs"):
             pairs = choose_pairs(surface_overlap(camera, poses, np.stack(depth)), PARTNERS)
+            if config.vary == "drift":
+                furthest = np.exp(np.random.default_rng([seed, 3]).uniform(np.log(3), np.log(len(poses))))
+                pairs = pairs[pairs[:, 1] - pairs[:, 0] <= furthest]
         database = folder / DATABASE_FILE
         model = triangulate_model(database, posed_model(camera, poses), stored, colors, pairs, run)
+        if config.vary == "drift":
+            with clock("adjust"):
+                estimate_poses(model)
         fix = "Map with more images (n_images), or check that the scene has texture."
         draft = MapDraft(model, Path(out_dir), config.max_reprojection_error_px, fix, database)
         landmarks, fields = finish_map(draft, folder, run)

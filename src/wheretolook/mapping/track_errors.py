@@ -15,14 +15,15 @@ from wheretolook.mapping.colmap_model import ModelArrays, observation_matrix, se
 MIN_OBSERVED = 12  # landmarks that are left of those that an image observes
 
 
-def log_error_ratio(images: ModelArrays, cameras: Mapping[int, Camera], noise_px: float) -> float | None:
+def log_error_ratio(images: ModelArrays, cameras: Mapping[int, Camera], noise_px: float) -> tuple[float, float] | None:
     """Estimate the log of the errors of poses on a map over their expected deviation, by its tracks alone.
 
     Blocks of a sixteenth and a quarter of the images, which share landmarks, are held out. The remaining landmarks are
     triangulated again, and images of the blocks localized by their keypoints, by Gauss-Newton steps from their poses in
     the whole map, with Cauchy weights. Expected deviations are those of independent keypoint noise (pixels) in all images.
-    Returns the mean of the medians for positions and orientations, within the range of the maps that it was measured on;
-    None if keypoints or cameras are unknown, or too few images can be tested.
+    Returns the mean of the medians for positions and orientations, within the range of the maps that it was measured on,
+    and its standard error over the images that blocks are around, NaN for one; None if keypoints or cameras are unknown,
+    or too few images can be tested.
     """
     known = set(np.unique(images.image_cameras).tolist()) <= cameras.keys()
     n = len(images.image_ids)
@@ -40,8 +41,14 @@ def log_error_ratio(images: ModelArrays, cameras: Mapping[int, Camera], noise_px
     tested = np.unique(np.concatenate([rows for _, rows in blocks]))
     seen = np.asarray(observes[tested].sum(0)).reshape(-1) > 0
     tracks = _Tracks(select_points(images, seen), cameras, noise_px)
-    logs = [pair for block in blocks for pair in tracks.log_ratios(*block)]
-    return float(np.clip(np.median(logs, axis=0).mean(), -0.5, 2.0)) if len(logs) >= 3 else None
+    of_block = [np.reshape(tracks.log_ratios(*block), (-1, 2)) for block in blocks]
+    logs = np.concatenate(of_block)
+    if len(logs) < 3:
+        return None
+    around = [np.concatenate(both) for both in zip(of_block[::2], of_block[1::2], strict=True)]
+    means = [part.mean() for part in around if len(part)]
+    error = np.std(means, ddof=1) / np.sqrt(len(means)) if len(means) > 1 else np.nan
+    return float(np.clip(np.median(logs, axis=0).mean(), -0.5, 2.0)), float(error)
 
 
 class _Tracks:

@@ -122,6 +122,33 @@ def triangulate_model(
     return model
 
 
+def estimate_poses(model: Any) -> None:
+    """Adjust poses, focal length and points of a triangulated reconstruction in place, and align it with its old poses.
+
+    Images that observe no point keep their poses.
+    """
+    images = [image for image in model.images.values() if image.num_points3D]
+    before = _frames(images)
+    options = pycolmap.BundleAdjustmentOptions(print_summary=False, refine_extra_params=False)
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1  # some tracks are wrong
+    options.ceres.solver_options.num_threads = 1  # for equal bytes
+    adjusted = pycolmap.BundleAdjustmentConfig()
+    for image in images:
+        adjusted.add_image(image.image_id)
+    pycolmap.create_default_bundle_adjuster(options, adjusted, model).solve()
+    to_frame = pycolmap.estimate_sim3d(_frames(images), before)
+    if to_frame is not None:
+        model.transform(to_frame)
+    model.update_point_3d_errors()
+
+
+def _frames(images: Sequence[Any]) -> NDArray[np.float64]:
+    """Return the centres of cameras and points 1 m from them along their axes, (4 I, 3)."""
+    ends = np.stack([image.cam_from_world().inverse().matrix().T for image in images])
+    ends[:, :3] += ends[:, 3:]
+    return ends.reshape(-1, 3)
+
+
 def write_matches(
     database: Path, pairs: NDArray[np.int64], matches: Iterable[NDArray[np.uint32]], ids: Sequence[int]
 ) -> None:

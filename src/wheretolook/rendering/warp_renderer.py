@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Any, Literal, Protocol
@@ -241,11 +241,29 @@ class WarpRenderer:
         poses: Float = check_poses(cam_from_world)
         if isinstance(camera, ColmapCamera):
             return render_distorted(self, camera, poses)
-        poses = poses_from(poses, self._origin)
+        rgb = np.empty((len(poses), camera.height, camera.width, 3), dtype=np.uint8)
+        depths = []
+        for rows, (colors, depth) in self._blocks(camera, poses):
+            rgb[rows] = self._staging.download(colors)
+            depths.append(depth)
+
+        def depth_m() -> NDArray[np.float32]:
+            parts = [depth.numpy() for depth in depths]
+            return np.concatenate([np.zeros((0, *rgb.shape[1:3]), dtype=np.float32), *parts])
+
+        return Rendering(rgb, depth_m)
+
+    def colors(self, camera: PinholeCamera, cam_from_world: ArrayLike) -> list[Any]:
+        """Render poses (B, 3, 4) as Warp arrays (b, H, W) of colours, B images in all, which stay on the device."""
+        colors = [images[0] for _, images in self._blocks(camera, check_poses(cam_from_world))]
+        wp.synchronize_device(self.device)
+        return colors
+
+    def _blocks(self, camera: PinholeCamera, cam_from_world: Float) -> Iterator[tuple[slice, list[Any]]]:
+        """Draw poses (B, 3, 4) and yield rows of poses with their colours and depths."""
+        poses = poses_from(cam_from_world, self._origin)
         height = camera.height
         width = camera.width
-        rgb = np.empty((len(poses), height, width, 3), dtype=np.uint8)
-        depths = []
         bytes_per_pose = height * width * 7
         if self.method == "raster":
             bytes_per_pose += height * width * 8 + self._vertices.shape[0] * 24
@@ -258,14 +276,7 @@ class WarpRenderer:
             centers, ray_from_pixel = camera_rays(camera, poses[rows])
             rays = (vec3_array(centers, self.device), self._array(ray_from_pixel.astype(np.float32), wp.mat33))
             draw(camera.matrix @ poses[rows], rays, images)
-            rgb[rows] = self._staging.download(images[0])
-            depths.append(images[1])
-
-        def depth_m() -> NDArray[np.float32]:
-            parts = [depth.numpy() for depth in depths]
-            return np.concatenate([np.zeros((0, height, width), dtype=np.float32), *parts])
-
-        return Rendering(rgb, depth_m)
+            yield rows, images
 
     # Both draw images (rgb, depth) of B poses, given (B, 3, 4) pixel_from_world and rays: centres and ray_from_pixel.
 

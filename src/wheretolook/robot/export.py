@@ -8,7 +8,7 @@ import json
 import warnings
 from collections.abc import Iterator
 from copy import deepcopy
-from dataclasses import replace
+from dataclasses import asdict, replace
 from math import sqrt
 from pathlib import Path
 from typing import Any
@@ -276,7 +276,7 @@ def _description(trained: TrainedNetwork[SetNetwork], camera: PinholeCamera, acc
         "map_attributes": list(MAP_ATTRIBUTES),
         "most": MAX_LANDMARKS,
         "accuracy": list(accuracy),
-        "error_scale": trained.error_scale,
+        "calibration": None if trained.of_map is None else asdict(trained.of_map),
         "range": training_range.record(),
         "serves_camera": bool(training_range.contains(camera_quantities(camera)[None])[0]),
     }

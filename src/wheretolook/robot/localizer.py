@@ -131,7 +131,7 @@ class RobotLocalizer:
         self._descriptors[:, : len(points)] = descriptors.T
         self._twins = descriptors if has_twins(self, descriptors, points) else None
         self._config = LocalizerConfig(method="hypotheses")
-        estimator = PoseEstimator(points, self._config, about.get("error_scale") is not None)
+        estimator = PoseEstimator(points, self._config, about.get("calibration") is not None)
         self._localizer = JointLocalizer(estimator, turn_noise_deg, True, expected)
         self._points = points
         self._mapping_distance_m = np.exp(distance)

@@ -7,7 +7,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from math import isfinite
+from math import isfinite, nan
 from pathlib import Path
 from typing import Any, Generic, Self, TypeVar
 
@@ -222,12 +222,33 @@ class StoredNetwork(nn.Module, ABC):
 NetworkT = TypeVar("NetworkT", bound=StoredNetwork)
 
 
+@dataclass(frozen=True)
+class MapCalibration:
+    """Errors of poses and probabilities of detection on a map of photographs, by its own images.
+
+    Standard errors are over held-out blocks of the images, None where the images determine nothing.
+    """
+
+    error_scale: float  # pixels: the map's keypoint noise times a factor by its tracks
+    log_error_scale_error: float | None = None
+    error_spread: float = nan  # standard deviation of the log errors of positions, the same for all maps
+    detection_offset: float = 0.0  # of the log-odds of detection
+    detection_offset_error: float | None = None
+
+    def describe(self) -> str:
+        """State the numbers for a summary."""
+        scale = f"errors of poses as of keypoints of {self.error_scale:.2f} px"
+        if self.log_error_scale_error is not None:
+            scale += f" (standard error {self.log_error_scale_error:.0%})"
+        offset = f"log-odds of detection {self.detection_offset:+.2f}"
+        if self.detection_offset_error is not None:
+            offset += f" (standard error {self.detection_offset_error:.2f})"
+        return f"{scale}, deviation of their logs {self.error_spread:.2f}; {offset}"
+
+
 @dataclass(frozen=True, eq=False)
 class TrainedNetwork(Generic[NetworkT]):
-    """A network and the calibration scale * logit + offset of its logits.
-
-    `error_scale` is that of the poses on a map of photographs, see `scorers.set.score.for_map`; None for a map of renders.
-    """
+    """A network and the calibration scale * logit + offset of its logits."""
 
     method: str
     network: NetworkT
@@ -236,7 +257,7 @@ class TrainedNetwork(Generic[NetworkT]):
     offset: float = 0.0
     training_range: TrainingRange | None = None  # of its training views; None if the weights do not store it
     accuracy: Accuracy = ACCURACY  # limits of its training views' errors, in metres and degrees
-    error_scale: float | None = None
+    of_map: MapCalibration | None = None  # see `scorers.set.score.for_map`; None for a map of renders
 
     def __post_init__(self) -> None:
         self.network.eval()

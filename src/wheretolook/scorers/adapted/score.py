@@ -20,7 +20,7 @@ from wheretolook.scorers.base import Scorer
 from wheretolook.scorers.registry import BuildOptions
 from wheretolook.scorers.set.network import SetNetwork
 from wheretolook.scorers.set.score import SetScorer
-from wheretolook.training.trained_network import StoredNetwork, TrainedNetwork, finite
+from wheretolook.training.trained_network import MapCalibration, StoredNetwork, TrainedNetwork, finite
 from wheretolook.utils.errors import WeightsError
 
 
@@ -112,7 +112,7 @@ class AdaptedScorer(Scorer):
                 network.base_scale,
                 network.base_offset,
                 trained.training_range,
-                error_scale=network.error_scale,
+                of_map=None if network.error_scale is None else MapCalibration(network.error_scale),
             ),
         )
 

@@ -166,7 +166,7 @@ class PhotographModel(AccuracyModel):
 
 def model_of(trained: TrainedNetwork[SetNetwork]) -> AccuracyModel:
     """Return the model of a network's views on its map."""
-    return AccuracyModel.bundled() if trained.error_scale is None else PhotographModel.bundled()
+    return AccuracyModel.bundled() if trained.of_map is None else PhotographModel.bundled()
 
 
 def probabilities(trained: TrainedNetwork[SetNetwork], accuracy: Accuracy, views: ViewSums) -> Float:
@@ -174,7 +174,7 @@ def probabilities(trained: TrainedNetwork[SetNetwork], accuracy: Accuracy, views
     with torch.inference_mode():
         logits = trained.network.logits(views).double()
         own = np.asarray(trained.calibrated(logits).sigmoid().cpu().numpy())
-    if trained.error_scale is None and accuracy == trained.accuracy:  # without further statistics
+    if trained.of_map is None and accuracy == trained.accuracy:  # without further statistics
         return own
     return np.asarray(model_of(trained).at(accuracy, trained.accuracy, own, statistics_of(trained, views)))
 
@@ -188,5 +188,5 @@ def statistics_of(trained: TrainedNetwork[SetNetwork], views: ViewSums) -> Float
 def statistics_on(trained: TrainedNetwork[SetNetwork], views: ViewSums) -> torch.Tensor:
     """Return `statistics_of` views as a tensor."""
     of_view = trained.network.statistics_of(views).double()
-    mapped = mapped_deviations(views, of_view)
-    return torch.cat([of_view, mapped + log(trained.error_scale or 1.0)], 1)
+    scale = 1.0 if trained.of_map is None else trained.of_map.error_scale
+    return torch.cat([of_view, mapped_deviations(views, of_view) + log(scale)], 1)

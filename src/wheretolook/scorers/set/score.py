@@ -6,7 +6,7 @@ import warnings
 from bisect import bisect_left
 from copy import copy, deepcopy
 from dataclasses import replace
-from math import exp
+from math import exp, isnan, nan, sqrt
 from typing import Any, Self
 
 import numpy as np
@@ -25,10 +25,11 @@ from wheretolook.mapping.colmap_model import observation_matrix, select_points
 from wheretolook.mapping.map import Map
 from wheretolook.mapping.track_errors import log_error_ratio
 from wheretolook.scorers.base import LandmarkProbabilities, Scorer
-from wheretolook.scorers.set.accuracy import model_of, probabilities, statistics_of
+from wheretolook.scorers.set.accuracy import PhotographModel, model_of, probabilities, statistics_of
 from wheretolook.scorers.set.directions import BatchedDirections
 from wheretolook.scorers.set.network import SetNetwork, bearing_precision
 from wheretolook.training.trained_network import (
+    MapCalibration,
     RangeWatch,
     TrainedNetwork,
     TrainingRange,
@@ -112,63 +113,69 @@ def for_map(trained: TrainedNetwork[SetNetwork], localization_map: LocalizationM
     network = deepcopy(trained.network)
     last = network.matchability.layers[-1]
     assert isinstance(last, torch.nn.Linear)
+    whole = localization_map.map.whole or localization_map.map
+    offset, offset_error = _known_offset(network, localization_map, whole)
+    scale, scale_error = error_scale(whole)
+    spread = PhotographModel.bundled().errors[0].deviation
+    of_map = MapCalibration(scale, scale_error, spread, offset, offset_error)
+    whole.computed.setdefault("calibration", of_map)
     with torch.no_grad():
-        last.bias.add_(_known_offset(network, localization_map))
-    return replace(trained, network=network, error_scale=error_scale(localization_map))
+        last.bias.add_(offset)
+    return replace(trained, network=network, of_map=of_map)
 
 
-def error_scale(localization_map: LocalizationMap) -> float:
-    """Return the scale of the errors of a map's poses: its keypoint noise in pixels, times a factor by its tracks.
+def error_scale(whole: Map) -> tuple[float, float | None]:
+    """Return the scale of the errors of a map's poses, and the standard error of its log, None if tracks show none.
 
+    It is the map's keypoint noise in pixels, times a factor by its tracks.
     The noise is at least a tenth of a pixel, less than that of SIFT: maps made from exact points have none. Of the log of
     the factor, `log_error_ratio` over its mean of maps of photographs, 0.4 counts (docs/research/cameras.md).
     """
-    whole = localization_map.map.whole or localization_map.map
     if "error_scale" not in whole.computed:
         noise_px = whole.landmarks.keypoint_noise_px
         if noise_px is None:
             text = "no landmark has a reprojection error: keypoints count as precise to a pixel"
             warnings.warn(f"{whole.path or 'map'}: {text}", MapWarning, stacklevel=2)
         noise_px = max(0.1, noise_px or 1.0)
-        ratio = None if whole.images is None else log_error_ratio(whole.images, whole.cameras, noise_px)
-        whole.computed["error_scale"] = noise_px * (1.0 if ratio is None else exp(0.4 * (ratio - 0.27)))
-    return float(whole.computed["error_scale"])
+        known = None if whole.images is None else log_error_ratio(whole.images, whole.cameras, noise_px)
+        ratio, error = known or (0.27, nan)
+        whole.computed["error_scale"] = noise_px * exp(0.4 * (ratio - 0.27)), None if isnan(error) else 0.4 * error
+    return whole.computed["error_scale"]
 
 
-def _known_offset(network: SetNetwork, localization_map: LocalizationMap) -> float:
+def _known_offset(network: SetNetwork, localization_map: LocalizationMap, whole: Map) -> tuple[float, float | None]:
     """Return `detection_offset`, estimated once for all cameras and parts of a map."""
-    whole = localization_map.map.whole or localization_map.map
-    if whole.images is None:
-        return 0.0
     known = whole.computed
     occlusion = localization_map.occlusion
     if isinstance(occlusion, CachedOcclusion):
         occlusion = occlusion.model
     if isinstance(occlusion, StoredOcclusion):  # of all landmarks at some locations only
-        return 0.0
+        return 0.0, None
     key = (occlusion, *(float(values.sum()) for values in network.parameters()))
     if key not in known:
         known[key] = detection_offset(network, localization_map)
     return known[key]
 
 
-def detection_offset(network: SetNetwork, localization_map: LocalizationMap) -> float:
-    """Estimate the offset of a network's log-odds of detection on a map from the tracks of its landmarks.
+def detection_offset(network: SetNetwork, localization_map: LocalizationMap) -> tuple[float, float | None]:
+    """Estimate the offset of a network's log-odds of detection on a map, and its standard error, from landmarks' tracks.
 
     Eight blocks of images that share landmarks are held out, an eighth of the images each, and two images of each are
     tested. With the offset, the network predicts as many detections of the remaining landmarks as there are
-    observations of them in these images. 0 if the images are unknown, fewer than five, or observe hardly any of these
-    landmarks. Measured in docs/research/cameras.md.
+    observations of them in these images. 0 and None if the images are unknown, fewer than five, or observe hardly any of
+    these landmarks. Measured in docs/research/cameras.md.
     """
     whole = localization_map.map.whole or localization_map.map
     images = whole.images
     if images is None or len(images.image_ids) < 5:
-        return 0.0
+        return 0.0, None
     kept = np.zeros(len(images.points), dtype=bool)
     kept[:: max(1, -(-len(kept) // 20_000))] = True  # evenly spread
     images = select_points(images, kept)
     observes = observation_matrix(images)
-    n_observed = 0.0
+    # of each block: observations, and landmarks in the lists below
+    n_observed: list[float] = []
+    lengths: list[int] = []
     log_odds: list[Tensor] = []
     weights: list[Tensor] = []
     seeing = np.flatnonzero(np.asarray(observes.sum(1)).reshape(-1))
@@ -181,7 +188,8 @@ def detection_offset(network: SetNetwork, localization_map: LocalizationMap) -> 
             continue
         describer = LandmarkDescriber(replace(localization_map, map=Map(remaining)), network.attributes)
         tested = block[spread_rows(len(block), 2)]
-        n_observed += observes[tested][:, np.isin(images.point_ids, remaining.ids)].sum()
+        n_observed.append(float(observes[tested][:, np.isin(images.point_ids, remaining.ids)].sum()))
+        lengths.append(0)
         for row in tested:
             camera = whole.cameras[int(images.image_cameras[row])]
             views = describer.of_camera(camera).in_blocks(images.image_poses[[row]], 512)
@@ -189,15 +197,22 @@ def detection_offset(network: SetNetwork, localization_map: LocalizationMap) -> 
                 with torch.inference_mode():
                     log_odds.append(network.matchability(described.values).double())
                 weights.append((n_visible / max(1, len(log_odds[-1]))).expand(len(log_odds[-1])))
-    if n_observed < 50:
-        return 0.0
+                lengths[-1] += len(log_odds[-1])
+    if sum(n_observed) < 50:
+        return 0.0, None
     each = torch.cat(weights)
     odds = torch.cat(log_odds)
 
-    def surplus(offset: float) -> float:
-        return float((each * (odds + offset).sigmoid()).sum()) - n_observed
+    def surpluses(offset: float) -> Tensor:  # of each block
+        predicted = (each * (odds + offset).sigmoid()).split(lengths)
+        return torch.tensor([float(part.sum()) for part in predicted]) - torch.tensor(n_observed)
 
-    return OFFSETS[min(bisect_left(OFFSETS, 0.0, key=surplus), len(OFFSETS) - 1)]
+    row = bisect_left(OFFSETS, 0.0, key=lambda offset: float(surpluses(offset).sum()))
+    offset = OFFSETS[min(row, len(OFFSETS) - 1)]
+    p = (odds + offset).sigmoid()
+    slope = float((each * p * (1 - p)).sum())  # of the sum of all surpluses
+    n = len(lengths)
+    return offset, surpluses(offset).std().item() * sqrt(n) / slope if n > 1 else None
 
 
 MAX_LANDMARKS = 1024
@@ -278,6 +293,7 @@ class SetScorer(LandmarkScorer):
             out_of_range=out_of_range,
             expected_error_m=errors[:, 0],
             expected_error_deg=errors[:, 1],
+            of_map=self.trained.of_map,
         )
 
     def _in_range(self, described: ViewLandmarks, n_visible: Tensor) -> NDArray[np.bool_]:

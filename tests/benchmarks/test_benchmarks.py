@@ -17,6 +17,7 @@ WEIGHTS = ROOT / "data" / "release" / "weights" / "set.safetensors"
 pytestmark = pytest.mark.slow
 
 SMALL = {
+    "campus": "--rooms 2 --voxels 8 --processes 1",
     "looks": f"--scene {ROOT}/data/release/apartment-209 --directions 30 --places 2",
     "robot": f"--weights {WEIGHTS} --landmarks 500 --directions 20 --repeats 2",
     "scale": "--landmarks 500 5000 --locations 1 2 --repeats 1 --out /dev/null",

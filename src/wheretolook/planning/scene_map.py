@@ -35,6 +35,7 @@ from wheretolook.scorers.registry import FALLBACK, is_probability, make_scorer, 
 from wheretolook.scorers.weights import load_scorer, resolve_weights
 from wheretolook.utils.errors import ConfigError, SceneError, check_range
 from wheretolook.visibility.counting import SurveyOptions, survey
+from wheretolook.visibility.occlusion import DevicePoints
 
 Text = str | None  # text of progress bars; None shows none
 
@@ -100,26 +101,34 @@ def _score_and_count(
 ) -> tuple[NDArray[np.uint16], NDArray[np.float32], NDArray[np.uint32]]:
     """Return ranked ids, scores and numbers of landmarks in view, each (L, D), of directions at locations (L, 3) m."""
     localization_map = scorer.localization_map
+    camera, occlusion, device = localization_map.camera, localization_map.occlusion, localization_map.device
     points = localization_map.landmarks.points
-    text = progress and f"{progress}: count"
-    options = SurveyOptions(keep=1, keep_occlusion=False, device=localization_map.device, progress=text)
-    rotations = rotation_looking_along(directions)
-    counted = survey(localization_map.camera, rotations, locations, points, localization_map.occlusion, options)
+    occlusion.check(locations, points)
     ranked = np.empty((len(locations), len(directions)), dtype=np.uint16)
     scores = np.empty(ranked.shape, dtype=np.float32)
+    n_visible = np.empty(ranked.shape, dtype=np.uint32)
     # enough views at once to fill a GPU, few enough for the progress bar to move
-    block = max(1, (1 << 14 if localization_map.device == "cpu" else 1 << 17) // len(directions))
-    text = progress and f"{progress}: score"
-    with tqdm(total=len(locations), desc=text, unit="voxel", disable=progress is None) as bar:
+    block = max(1, (1 << 14 if device == "cpu" else 1 << 18) // len(directions))
+    checked = spread_rows(len(locations), 1000)
+    counting = SurveyOptions(keep=1, keep_occlusion=False, device=device)
+    on_device = None
+    with tqdm(total=len(locations), desc=progress, unit="voxel", disable=progress is None) as bar:
         for begin in range(0, len(locations), block):
             rows = slice(begin, begin + block)
-            values = scorer.score_directions(locations[rows], directions)
+            at = locations[rows]
+            values, counts = scorer.score_and_count(at, directions)
+            if counts is None:
+                on_device = on_device or DevicePoints(points, device)
+                rotations = rotation_looking_along(directions)
+                counts = survey(camera, rotations, at, on_device, occlusion, counting).counts
             ranked[rows] = np.argsort(-values, axis=1, kind="stable")
             scores[rows] = values
+            n_visible[rows] = counts
+            some = checked[(checked >= begin) & (checked < begin + block)]
+            if len(some):  # warns of views out of range
+                scorer.score(poses_looking_along(locations[some], directions[ranked[some, 0]]))
             bar.update(len(values))
-    checked = spread_rows(len(locations), 1000)
-    scorer.score(poses_looking_along(locations[checked], directions[ranked[checked, 0]]))  # warns of views out of range
-    return ranked, scores, counted.counts.astype(np.uint32)
+    return ranked, scores, n_visible
 
 
 def _unit(directions: ArrayLike) -> Float:

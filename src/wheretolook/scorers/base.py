@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -74,6 +74,10 @@ class Scorer(ABC):
         at = np.repeat(locations, len(directions), axis=0)
         axes = np.tile(directions, (len(locations), 1))
         return self.score(poses_looking_along(at, axes)).reshape(len(locations), len(directions))
+
+    def score_and_count(self, locations: Float, directions: Float) -> tuple[Float, NDArray[Any] | None]:
+        """Return `score_directions` and the landmarks in view, (L, D) each; None where the method does not count them."""
+        return self.score_directions(locations, directions), None
 
     def report(self, cam_from_world: Float) -> Views:
         """Score poses (B, 3, 4) and report what else is known of their views."""

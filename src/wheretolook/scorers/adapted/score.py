@@ -124,6 +124,11 @@ class AdaptedScorer(Scorer):
         """Return probabilities (L, D); see `SetScorer.score_directions`."""
         return self._adapted(self.base.score_directions(check_locations(locations), directions))
 
+    def score_and_count(self, locations: Float, directions: Float) -> tuple[Float, NDArray[Any] | None]:
+        """See `SetScorer.score_and_count`."""
+        scores, counts = self.base.score_and_count(locations, directions)
+        return self._adapted(scores), counts
+
     def report(self, cam_from_world: Float) -> Views:
         """Return the base network's report with the adapted score."""
         report = self.base.report(cam_from_world)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from math import log
 from typing import Any
 
@@ -21,6 +20,7 @@ from wheretolook.scorers.set import directions_kernel
 from wheretolook.scorers.set.accuracy import probabilities
 from wheretolook.scorers.set.network import CELLS, SetNetwork, ViewSums, along
 from wheretolook.training.trained_network import TrainedNetwork
+from wheretolook.utils.devices import in_threads
 from wheretolook.utils.processes import cores
 from wheretolook.visibility.counting import FrustumLister, choose_size
 from wheretolook.visibility.occlusion import DevicePoints, morton_codes
@@ -36,7 +36,7 @@ class BatchedDirections:
     """Scores the same directions (D, 3), unit vectors in the world, at any location.
 
     A view of more than `limit` landmarks is scored from every second, every fourth, and so on, along a curve through
-    space (`DevicePoints`), see `FrustumLister`.
+    space (`DevicePoints`), see `FrustumLister`. On a GPU 8 lanes, that is threads, share the landmarks of a view.
     """
 
     def __init__(
@@ -46,6 +46,7 @@ class BatchedDirections:
         directions: Float,
         limit: int,
         accuracy: Accuracy,
+        lanes: int | None = None,
     ) -> None:
         self.localization_map = localization_map
         self.trained = trained
@@ -62,7 +63,9 @@ class BatchedDirections:
         self.lister = FrustumLister(camera, rotations, 0, device, size=size, scratch_bytes=1 << 24)
         with torch.inference_mode():
             self.network = self._network()
-        self._describe, self._sum = directions_kernel.kernels(self.network.bias.shape[0])
+        self.lanes = lanes or (1 if device == "cpu" else 8)
+        self._describe, self._sum = directions_kernel.kernels(self.network.bias.shape[0], self.lanes)
+        self._open = len(self.points)  # about how many landmarks are unoccluded from a location
         self._edges: Any = wp.array(
             np.tan((np.arange(CELLS + 1) / CELLS - 0.5) * np.pi), dtype=wp.float64, device=device
         )
@@ -111,48 +114,46 @@ class BatchedDirections:
         return network
 
     def _reach(self) -> tuple[float, float]:
-        """Return the largest positions in an image, across and down.
-
-        On a GPU and of other cameras than pinholes they exceed all, and no unit is computed in advance: threads side
-        by side are faster where all do the same.
-        """
+        """Return the largest positions in an image, across and down; of other cameras than pinholes they exceed all."""
         camera = self.localization_map.camera
-        if self.points.device != "cpu" or not isinstance(camera, PinholeCamera):
+        if not isinstance(camera, PinholeCamera):
             return 1e30, 1e30
         return (
             max(camera.cx, camera.width - camera.cx) / camera.fx,
             max(camera.cy, camera.height - camera.cy) / camera.fy,
         )
 
-    def score(self, locations: Float) -> Float:
-        """Return scores (L, D) at locations (L, 3) m; a PoseError if one is not finite."""
+    def score(self, locations: Float) -> tuple[Float, Float]:
+        """Return scores and landmarks in view (L, D) at locations (L, 3) m; a PoseError if one is not finite.
+
+        Where only a camera of COLMAP can decide what is in view, and a part is listed, their number is estimated.
+        """
         locations = check_locations(locations)
-        scores = np.empty((len(locations), len(self.directions)))
-        on_cpu = self.points.device == "cpu"
-        # landmarks times locations in a block
-        step = max(1, (1 << 17 if on_cpu else 1 << 21) // max(1, len(self.points)))
-        if on_cpu:
-            step = min(step, -(-len(locations) // (4 * cores())))
-        blocks = [slice(begin, begin + step) for begin in range(0, len(locations), step)]
+        n_points = len(self.points)
+        found = np.empty((2, len(locations), len(self.directions)))
+        workers = 1
+        if self.points.device == "cpu":  # blocks are small: each thread has its own
+            workers = cores()
+            step = min((1 << 17) // max(1, n_points), -(-len(locations) // (4 * workers)))
+        else:  # many views occupy a GPU; what is unoccluded takes at most 14 times this memory
+            required = self.lister.bytes_per_location(n_points) + 30_000 * len(self.directions)
+            memory = wp.get_device(self.points.device).total_memory // 32
+            step = min(memory // required, self.lister.max_locations(n_points))
 
         def work(rows: slice) -> None:
-            scores[rows, self.order] = self._score(locations[rows])
+            torch.set_num_threads(1 if workers > 1 else threads)
+            found[:, rows, self.order] = self._score(locations[rows])
 
-        if not on_cpu:
-            for rows in blocks:
-                work(rows)
-            return scores
         threads = torch.get_num_threads()
-        pool = ThreadPoolExecutor(cores(), initializer=torch.set_num_threads, initargs=(1,))
         try:
-            with pool:  # blocks are small: each thread has its own
-                list(pool.map(work, blocks))
+            blocks = [slice(begin, begin + max(1, step)) for begin in range(0, len(locations), max(1, step))]
+            list(in_threads(work, blocks, workers))
         finally:
             torch.set_num_threads(threads)
-        return scores
+        return found[0], found[1]
 
     def _score(self, locations: Float) -> Float:
-        """Return scores (L, D) of the directions in `order`."""
+        """Return scores and landmarks in view (2, L, D) of the directions in `order`."""
         device = self.points.device
         mask = self.localization_map.occlusion.unoccluded_on_device(locations, self.points)
         nearby = self.lister.surroundings(locations, self.points.double, mask)
@@ -166,20 +167,26 @@ class BatchedDirections:
         width = self.network.bias.shape[0]
         described: Any = directions_kernel.Described()
         described.n_open = empty(number, dtype=wp.int32)
-        described.open = empty(number, width, dtype=wp.uint8)
-        described.layers = empty(number, 6 * width)
         described.terms = empty(number, dtype=directions_kernel.Sums)
+        if self.lanes > 1:
+            described.open, described.layers = empty(1, 1, dtype=wp.uint8), empty(width, number)
+        else:
+            described.open, described.layers = empty(number, width, dtype=wp.uint8), empty(number, 6 * width)
         wp.launch(self._describe, number, [self.network, nearby.offsets, nearby.rows], [described], device=device)
         numbers: Any = (listed.n_visible, listed.starts, listed.lengths)
         uploaded: list[Any] = [wp.array(values, device=device) for values in numbers]
         visible, starts, lengths = uploaded
-        none: Any = wp.ones((len(views), CELLS**2), dtype=wp.float32, device=device)
-        sums, cells = empty(len(views), dtype=directions_kernel.Sums), empty(len(views))
+        none: Any = wp.full((len(views), CELLS**2), float(self.lanes == 1), dtype=wp.float32, device=device)
+        sums, cells = empty(len(views), self.lanes, dtype=directions_kernel.Sums), empty(len(views))
         inputs = [self.network, described, starts, lengths, listed.entries, listed.image, visible, self._edges, none]
-        wp.launch(self._sum, len(views), inputs, [sums, cells], device=device)
+        wp.launch(self._sum, sums.shape, inputs, [sums, cells], device=device)
         wp.synchronize_device(device)  # Torch works on a stream of its own
-        of_views = ViewSums(*(wp.to_torch(array) for array in (sums, visible, cells)))
-        return probabilities(self.trained, self.accuracy, of_views).reshape(len(locations), -1)
+        seen, summed, in_cells = (wp.to_torch(array) for array in (visible, sums, cells))
+        each = (seen / wp.to_torch(lengths).clamp(min=1))[:, None]
+        if self.lanes > 1:
+            in_cells = -torch.expm1(wp.to_torch(none) * each).sum(1)
+        scores = probabilities(self.trained, self.accuracy, ViewSums(summed.sum(1) * each, seen, in_cells))
+        return np.stack([scores, listed.n_visible]).reshape(2, len(locations), -1)
 
 
 def _columns(weight: Tensor, names: tuple[str, ...], wanted: tuple[str, ...]) -> Tensor:

@@ -2,6 +2,8 @@
 
 For a landmark and a location, most units of the first layer are off, or on, wherever the landmark is in the image. What
 those that are on add to the second layer is linear in that position, and computed once for all views of the location.
+Threads side by side on a GPU are faster where all do the same: there nothing is computed in advance, and several lanes
+share the landmarks of a view.
 """
 
 # mypy: ignore-errors
@@ -46,7 +48,7 @@ class Described:
     n_open: wp.array[wp.int32]  # (M,) units of the first layer that are on in a part of the image
     open: wp.array2d[wp.uint8]  # (M, W) these units
     # (M, 6 W): the second layer without open units, and these, each in the centre of the image, and what they gain
-    # across and down
+    # across and down; on a GPU (W, M) the first layer in the centre of the image
     layers: wp.array2d[wp.float32]
     terms: wp.array[Sums]  # (M,) of `expected_parts`, for a detected landmark
 
@@ -97,13 +99,13 @@ def cell_along(x: wp.float32, edges: wp.array[wp.float64]) -> wp.int32:
 
 
 DESCRIBE = """
-    const float* __restrict__ image = &wp::index(of_image, 0, 0);
-    const float* __restrict__ location = &wp::index(of_location, 0, 0);
-    const float* __restrict__ second = &wp::index(weights, 0, 0);
-    const float* __restrict__ base = &wp::index(first, row, 0);
-    float* __restrict__ sum = &wp::index(layers, entry, 0);
+    const float* __restrict__ image = &wp::index(network.of_image, 0, 0);
+    const float* __restrict__ location = &wp::index(network.of_location, 0, 0);
+    const float* __restrict__ second = &wp::index(network.second, 0, 0);
+    const float* __restrict__ base = &wp::index(network.first, row, 0);
+    float* __restrict__ sum = &wp::index(described.layers, entry, 0);
     for (int j = 0; j < W; ++j) {
-        sum[j] = wp::index(bias, j);
+        sum[j] = wp::index(network.bias, j);
         sum[W + j] = sum[2 * W + j] = 0.0f;
     }
     int n_open = 0;
@@ -111,7 +113,7 @@ DESCRIBE = """
         const float a = image[unit], b = image[W + unit];
         float value = base[unit];
         for (int k = 0; k < 4; ++k) value += values[k] * location[k * W + unit];
-        const float range = reach[0] * wp::abs(a) + reach[1] * wp::abs(b);
+        const float range = network.reach[0] * wp::abs(a) + network.reach[1] * wp::abs(b);
         if (value >= range) {
             const float* __restrict__ weight = second + W * unit;
             for (int j = 0; j < W; ++j) {
@@ -120,7 +122,7 @@ DESCRIBE = """
                 sum[2 * W + j] += b * weight[j];
             }
         } else if (value > -range) {
-            wp::index(open, entry, n_open) = unit;
+            wp::index(described.open, entry, n_open) = unit;
             sum[3 * W + n_open] = value;
             sum[4 * W + n_open] = a;
             sum[5 * W + n_open++] = b;
@@ -130,16 +132,16 @@ DESCRIBE = """
 """
 
 LOG_ODDS = """
-    const float* __restrict__ second = &wp::index(weights, 0, 0);
-    const float* __restrict__ out = &wp::index(last, 0);
-    const float* __restrict__ base = &wp::index(layers, entry, 0);
+    const float* __restrict__ second = &wp::index(network.second, 0, 0);
+    const float* __restrict__ out = &wp::index(network.last, 0);
+    const float* __restrict__ base = &wp::index(described.layers, entry, 0);
     float sum[W];
     for (int j = 0; j < W; ++j) sum[j] = base[j] + at[0] * base[W + j] + at[1] * base[2 * W + j];
     float value[W];
     for (int j = 0; j < W; ++j)
         value[j] = wp::max(base[3 * W + j] + at[0] * base[4 * W + j] + at[1] * base[5 * W + j], 0.0f);
-    for (int k = 0; k < n_open; ++k) {
-        const float* __restrict__ weight = second + W * wp::index(open, entry, k);
+    for (int k = 0; k < wp::index(described.n_open, entry); ++k) {
+        const float* __restrict__ weight = second + W * wp::index(described.open, entry, k);
         for (int j = 0; j < W; ++j) sum[j] += value[k] * weight[j];
     }
     float part[8] = {};  // so that the CPU adds eight at a time
@@ -150,36 +152,47 @@ LOG_ODDS = """
     return log_odds;
 """
 
+DESCRIBE_ALL = """
+    for (int unit = 0; unit < W; ++unit) {
+        float value = wp::index(network.first, row, unit);
+        for (int k = 0; k < 4; ++k) value += values[k] * wp::index(network.of_location, k, unit);
+        wp::index(described.layers, unit, entry) = value;
+    }
+    return W;
+"""
+
+LOG_ODDS_ALL = """
+    const float* __restrict__ image = &wp::index(network.of_image, 0, 0);
+    const float* __restrict__ second = &wp::index(network.second, 0, 0);
+    const float* __restrict__ out = &wp::index(network.last, 0);
+    float sum[W];
+    #pragma unroll
+    for (int j = 0; j < W; ++j) sum[j] = wp::index(network.bias, j);
+    for (int unit = 0; unit < W; ++unit) {
+        const float there = wp::index(described.layers, unit, entry) + at[0] * image[unit] + at[1] * image[W + unit];
+        const float value = wp::max(there, 0.0f);
+        #pragma unroll
+        for (int j = 0; j < W; ++j) sum[j] += value * second[W * unit + j];
+    }
+    float log_odds = out[W];
+    #pragma unroll
+    for (int j = 0; j < W; ++j) log_odds += wp::max(sum[j], 0.0f) * out[j];
+    return log_odds;
+"""
+
 
 @cache
-def kernels(width: int) -> tuple[wp.Kernel, wp.Kernel]:
-    """Return `describe_kernel` and `sum_kernel` for layers of `width` units, a multiple of 8."""
+def kernels(width: int, lanes: int) -> tuple[wp.Kernel, wp.Kernel]:
+    """Return `describe_kernel` and `sum_kernel` for layers of `width` units, a multiple of 8; with lanes those of a GPU."""
+    describe_text, log_odds_text = (DESCRIBE, LOG_ODDS) if lanes == 1 else (DESCRIBE_ALL, LOG_ODDS_ALL)
 
-    @wp.func_native(f"const int W = {width};{DESCRIBE}")
+    @wp.func_native(f"const int W = {width};{describe_text}")
     def describe(
-        entry: wp.int32,
-        row: wp.int32,
-        values: wp.vec4,
-        first: wp.array2d[wp.float32],
-        of_location: wp.array2d[wp.float32],
-        of_image: wp.array2d[wp.float32],
-        weights: wp.array2d[wp.float32],
-        bias: wp.array[wp.float32],
-        reach: wp.vec2,
-        open: wp.array2d[wp.uint8],
-        layers: wp.array2d[wp.float32],
+        network: Matchability, described: Described, entry: wp.int32, row: wp.int32, values: wp.vec4
     ) -> wp.int32: ...
 
-    @wp.func_native(f"const int W = {width};{LOG_ODDS}")
-    def log_odds_of(
-        entry: wp.int32,
-        n_open: wp.int32,
-        at: wp.vec2,
-        weights: wp.array2d[wp.float32],
-        last: wp.array[wp.float32],
-        open: wp.array2d[wp.uint8],
-        layers: wp.array2d[wp.float32],
-    ) -> wp.float32: ...
+    @wp.func_native(f"const int W = {width};{log_odds_text}")
+    def log_odds_of(network: Matchability, described: Described, entry: wp.int32, at: wp.vec2) -> wp.float32: ...
 
     @wp.kernel(module="unique", module_options=OPTIONS)
     def describe_kernel(
@@ -196,19 +209,7 @@ def kernels(width: int) -> tuple[wp.Kernel, wp.Kernel]:
         values = wp.vec4(log_distance, angle, log_distance - mapped[3], size_ratio) - network.mean
         for k in range(4):
             values[k] = known(values[k])
-        described.n_open[entry] = describe(
-            entry,
-            row,
-            values,
-            network.first,
-            network.of_location,
-            network.of_image,
-            network.second,
-            network.bias,
-            network.reach,
-            described.open,
-            described.layers,
-        )
+        described.n_open[entry] = describe(network, described, entry, row, values)
         described.terms[entry] = terms_of(offset, size_ratio, angle, network.pixel_angle, mapped)
 
     @wp.kernel(module="unique", module_options=OPTIONS)
@@ -222,31 +223,36 @@ def kernels(width: int) -> tuple[wp.Kernel, wp.Kernel]:
         n_visible: wp.array[wp.float32],
         edges: wp.array[wp.float64],
         none: wp.array2d[wp.float32],
-        sums: wp.array[Sums],
+        sums: wp.array2d[Sums],
         cells: wp.array[wp.float32],
     ):
-        """Sum over the landmarks of each view; `none` (V, cells) is one, and for the probabilities of its cells."""
-        view = wp.tid()
+        """Sum over every lanes-th landmark of each view.
+
+        `none` (V, cells), 1, gets the probabilities that none is detected in a cell; with lanes their logs, from 0 on.
+        """
+        view, lane = wp.tid()
         total = Sums()
-        for k in range(wp.int32(lengths[view])):
+        for k in range(lane, wp.int32(lengths[view]), lanes):
             number = starts[view] + wp.int64(k)
             entry = entries[number]
             at = image[number]
-            log_odds = log_odds_of(
-                entry, described.n_open[entry], at, network.second, network.last, described.open, described.layers
-            )
-            odds = wp.exp(wp.min(log_odds, 80.0))  # finite
+            odds = wp.exp(wp.min(log_odds_of(network, described, entry, at), 80.0))  # finite
             missed = 1.0 / (1.0 + odds)
             total += odds * missed * described.terms[entry]
-            none[view, cell_along(at[1], edges) * CELLS + cell_along(at[0], edges)] *= missed
-        each = n_visible[view] / wp.float32(wp.max(lengths[view], wp.int64(1)))
-        expected = wp.float32(0.0)
-        for cell in range(CELLS * CELLS):
-            if none[view, cell] < 1.0:
-                if each > 1.0:
-                    none[view, cell] = wp.pow(none[view, cell], each)
-                expected += 1.0 - none[view, cell]
-        sums[view] = each * total
-        cells[view] = expected
+            cell = cell_along(at[1], edges) * CELLS + cell_along(at[0], edges)
+            if wp.static(lanes == 1):
+                none[view, cell] *= missed
+            else:
+                wp.atomic_add(none, view, cell, wp.log(missed))
+        sums[view, lane] = total
+        if wp.static(lanes == 1):
+            each = n_visible[view] / wp.float32(wp.max(lengths[view], wp.int64(1)))
+            expected = wp.float32(0.0)
+            for cell in range(CELLS * CELLS):
+                if none[view, cell] < 1.0:
+                    if each > 1.0:
+                        none[view, cell] = wp.pow(none[view, cell], each)
+                    expected += 1.0 - none[view, cell]
+            cells[view] = expected
 
     return describe_kernel, sum_kernel

@@ -7,7 +7,7 @@ from bisect import bisect_left
 from copy import copy, deepcopy
 from dataclasses import replace
 from math import exp, isnan, nan, sqrt
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from wheretolook.dataset.config import Accuracy, checked_accuracy, threshold_key
-from wheretolook.geometry.camera import Camera
+from wheretolook.geometry.camera import Camera, ColmapCamera
 from wheretolook.geometry.lattices import spread_rows
 from wheretolook.geometry.poses import Float, check_poses
 from wheretolook.geometry.views import Views
@@ -313,6 +313,14 @@ class SetScorer(LandmarkScorer):
 
     def score_directions(self, locations: Float, directions: Float) -> Float:
         """Return probabilities (L, D); where many landmarks are visible, from another sample than `score`."""
+        return self._of_directions(locations, directions)[0]
+
+    def score_and_count(self, locations: Float, directions: Float) -> tuple[Float, NDArray[Any] | None]:
+        """See `Scorer.score_and_count`; a camera of COLMAP only estimates the number."""
+        scores, counts = self._of_directions(locations, directions)
+        return scores, None if isinstance(self.localization_map.camera, ColmapCamera) else counts
+
+    def _of_directions(self, locations: Float, directions: Float) -> tuple[Float, Float]:
         if self._batched is None or not np.array_equal(self._batched.directions, directions):
             self._batched = BatchedDirections(
                 self.localization_map, self.trained, directions, MAX_LANDMARKS, self.accuracy

@@ -14,7 +14,7 @@ from wheretolook.commands.options import MeshSource, ScenesConfig
 from wheretolook.commands.scenes import Scenes
 from wheretolook.dataset.viewpoint_files import FIRST_FIELDS, MATCH_FIELDS, SCHEMA, read_table, write_table
 from wheretolook.dataset.viewpoint_table import LOCALIZED, TOO_FEW_MATCHES, is_good, poses, with_first_labels
-from wheretolook.features.extractor import Keypoints
+from wheretolook.features.extractor import ExtractorConfig, Keypoints
 from wheretolook.features.matches import Matches
 from wheretolook.geometry.camera import ColmapCamera, PinholeCamera
 from wheretolook.geometry.poses import pose_error, transform
@@ -26,6 +26,7 @@ from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.scenes.loading import load_mesh, save_glb
 from wheretolook.utils.errors import ConfigError, SceneError, TableError
+from wheretolook.utils.processes import cores
 
 
 @pytest.mark.usefixtures("in_this_process")
@@ -143,6 +144,25 @@ def test_a_pose_is_found_with_every_camera(room, camera):
     assert estimate.status == LOCALIZED
     (error_m,), (error_deg,) = pose_error(estimate.cam_from_world[None], pose[None])
     assert error_m < 0.02 and error_deg < 0.3 and len(estimate.inlier_rows) >= 0.4 * len(rows)
+
+
+@pytest.mark.parametrize(
+    ("there", "place", "options"),
+    [
+        (True, "cuda:0", {}),
+        (False, "cpu", {}),
+        (False, "cuda", {"extractor": ExtractorConfig("colmap")}),
+        (
+            False,
+            "cuda",
+            {"cameras": ((0, CAMERA), (1, ColmapCamera("FOV", 640, 480, (300.0, 300.0, 320.0, 240.0, 0.9))))},
+        ),
+    ],
+)
+def test_one_process_owns_a_gpu_if_all_steps_run_there(room, there, place, options):
+    job = replace(room.job, device=place, **options)
+    assert job.on_gpu == there
+    assert job.processes == (1 if there else cores())
 
 
 def test_views_of_several_cameras_are_labelled_as_each_alone(room):

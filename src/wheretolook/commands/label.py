@@ -106,7 +106,7 @@ class Label(LabelOptions):
     ) -> dict[str, float]:
         """Label scenes and store their keys. Returns the seconds that each step took."""
         from wheretolook.dataset.viewpoint_files import write_table
-        from wheretolook.localization.labeller import LabelTask, label_scenes, processes_of
+        from wheretolook.localization.labeller import LabelTask, label_scenes
 
         config = self.label
         scenes = {files.name: files for files in to_label}
@@ -137,7 +137,7 @@ class Label(LabelOptions):
                 progress(1)
         wall = time.monotonic() - start
         total = sum(seconds.values()) or 1.0
-        workers = config.workers or processes_of(tasks[0].job)
+        workers = config.workers or max(task.job.processes for task in tasks)
         times = ", ".join(
             f"{step} {spent:.1f} ({spent / total:.0%}, alone {spent / workers:.1f})" for step, spent in seconds.items()
         )

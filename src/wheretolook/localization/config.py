@@ -85,7 +85,7 @@ class LabelConfig:
         ray_address: address of the Ray cluster, such as "auto" on one of its machines, or "ray://head:10001" from
             another (needs `pip install 'ray[client]'`); empty starts one on this machine.
         workers: worker processes on this machine; 0 for one per CPU core, or one per GPU where all steps run there.
-        shard_size: viewpoints in a shard; on a GPU at least 8,192. An interruption loses the shards in progress.
+        shard_size: viewpoints in a shard; at least 8,192 if all steps run on a GPU. An interruption loses the shards in progress.
         store_matches: store the rows of the landmarks that each view matched (matched_rows) and of the inliers
             (inlier_rows); needed to train matchability.
         appearance: 0 to 1, the highest strength at which queries are made to resemble photographs: exposure, white

@@ -22,7 +22,7 @@ from tqdm.auto import tqdm
 from wheretolook.dataset.viewpoint_files import SCHEMA, read_table, write_table
 from wheretolook.dataset.viewpoint_table import CAMERA_ID, LABELS
 from wheretolook.localization.config import LabelConfig, versions
-from wheretolook.localization.shard import LabelledShard, SceneJob, Shard, ShardWorker, processes_of, run_local
+from wheretolook.localization.shard import LabelledShard, SceneJob, Shard, ShardWorker, run_local
 from wheretolook.rendering.warp_renderer import method_on
 from wheretolook.utils.errors import ConfigError, TableError, WhereToLookError, WorkerError
 from wheretolook.utils.files import atomic_write, fingerprint, sha256, write_json
@@ -136,8 +136,10 @@ class _SceneInProgress:
         text = json.dumps(settings, sort_keys=True).encode()
         inputs = [name for name in (*SCHEMA.names, CAMERA_ID) if name not in LABELS and name in table]
         shards = []
-        if job.device != "cpu":  # in many batches, of which the first and last leave some steps idle
+        if job.on_gpu:  # in many batches, of which the first and last leave some steps idle
             shard_size = max(shard_size, 8192)
+        elif job.device != "cpu":  # a batch is of one camera
+            shard_size = max(shard_size, 16 * len(job.cameras))
         for begin in range(0, len(table), shard_size):
             rows = table.iloc[begin : begin + shard_size]
             content = pd.util.hash_pandas_object(rows[inputs], index=False).to_numpy()
@@ -158,7 +160,7 @@ def _run(shards: Sequence[Shard], config: LabelConfig) -> Generator[tuple[Shard,
     if config.engine == "ray" and shards:
         yield from run_ray(shards, config.ray_address)
     elif shards:
-        yield from run_local(shards, config.workers or processes_of(shards[0].job))
+        yield from run_local(shards, config.workers or max(shard.job.processes for shard in shards))
 
 
 def _read(shard: Shard) -> pd.DataFrame:

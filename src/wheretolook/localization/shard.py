@@ -29,7 +29,7 @@ from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.rendering.appearance import Appearance
 from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.scenes.loading import load_mesh
-from wheretolook.utils.devices import run_halving
+from wheretolook.utils.devices import in_threads, run_halving
 from wheretolook.utils.errors import WhereToLookError, WorkerError
 from wheretolook.utils.processes import WorkerPool, cores, worker_number
 
@@ -106,6 +106,19 @@ class SceneJob:
     changes: float = 0.0  # strength of the changes in `changed_mesh`; add the column `CHANGES`
     changed_mesh: Path | None = None  # shown by the views of about half of the locations
 
+    @property
+    def on_gpu(self) -> bool:
+        """Whether all steps run on a GPU."""
+        pinholes = all(isinstance(camera, PinholeCamera) for camera in (self.camera, *dict(self.cameras).values()))
+        return self.device != "cpu" and self.extractor.method != "colmap" and pinholes
+
+    @property
+    def processes(self) -> int:
+        """Number of processes that label the scene: one for each GPU if all steps run there, or for each core."""
+        if not self.on_gpu:
+            return cores()
+        return torch.cuda.device_count() if self.device == "cuda" else 1
+
 
 @dataclass(frozen=True, eq=False)
 class Shard:
@@ -168,15 +181,6 @@ class ShardWorker:
         return self._scene[1:]
 
 
-def processes_of(job: SceneJob) -> int:
-    """Number of processes that label: one for each GPU if all steps run there, otherwise one for each core."""
-    cameras = [job.camera, *(camera for _, camera in job.cameras)]
-    pinholes = all(isinstance(camera, PinholeCamera) for camera in cameras)
-    if job.device == "cpu" or job.extractor.method == "colmap" or not pinholes:
-        return cores()
-    return torch.cuda.device_count() if job.device == "cuda" else 1
-
-
 _worker: ShardWorker | None = None
 
 
@@ -227,7 +231,7 @@ def label_rows(
             for start in range(0, len(part), size):
                 batch = part[start : start + size]
                 batches.append(_Batch(shown, camera, batch, true_poses[batch], [drawn[row] for row in batch if drawn]))
-    labeller = _BatchLabeller(localizer)
+    labeller = _BatchLabeller(localizer, cores() if job.on_gpu else 1)
     steps = [
         Step("render", labeller.render),
         Step("extract", labeller.extract),
@@ -273,14 +277,17 @@ class _Batch:
 class _BatchLabeller:
     """Steps by which a batch of views is labelled; the batch goes with its images, keypoints and matches."""
 
-    def __init__(self, localizer: Localizer) -> None:
+    def __init__(self, localizer: Localizer, threads: int) -> None:
         self.localizer = localizer
+        self.threads = threads  # that change the appearance of images
 
     def render(self, batch: _Batch) -> tuple[_Batch, Sequence[NDArray[np.uint8]]]:
         extractor = self.localizer.extractor
         on_device = extractor.on_gpu and extractor.config.method == "opencv" and not batch.drawn
-        images = _images_on_device if on_device and isinstance(batch.camera, PinholeCamera) else _images
-        return batch, run_halving(lambda views: images(batch, views), np.arange(len(batch.rows)))
+        views = np.arange(len(batch.rows))
+        if on_device and isinstance(batch.camera, PinholeCamera):
+            return batch, run_halving(lambda some: _images_on_device(batch, some), views)
+        return batch, run_halving(lambda some: _images(batch, some, self.threads), views)
 
     def extract(self, rendered: tuple[_Batch, Sequence[NDArray[np.uint8]]]) -> tuple[_Batch, list[Keypoints]]:
         batch, images = rendered
@@ -301,13 +308,17 @@ def _images_on_device(batch: _Batch, views: NDArray[np.int64]) -> list[torch.Ten
     return [image for block in colors for image in wp.to_torch(block)]
 
 
-def _images(batch: _Batch, views: NDArray[np.int64]) -> NDArray[np.uint8]:
+def _images(batch: _Batch, views: NDArray[np.int64], threads: int) -> NDArray[np.uint8]:
     """Render some views (V,) of a batch as images (V, H, W, 3), with their appearances if these are drawn."""
     seen = batch.renderer.render(batch.camera, batch.cam_from_world[views])
     if not batch.drawn:
         return seen.rgb
-    rendered = zip(views, seen.rgb, seen.depth_m, strict=True)
-    return np.stack([batch.drawn[view].apply(rgb, batch.camera, depth_m) for view, rgb, depth_m in rendered])
+    depths = seen.depth_m
+
+    def changed(n: int) -> NDArray[np.uint8]:
+        return batch.drawn[views[n]].apply(seen.rgb[n], batch.camera, depths[n])
+
+    return np.stack([*in_threads(changed, range(len(views)), threads)])
 
 
 def _is_changed(table: pd.DataFrame, seed: int) -> NDArray[np.bool_]:

@@ -71,13 +71,13 @@ class Scorer(ABC):
 
         Methods that sample landmarks may differ slightly from `score`.
         """
-        at = np.repeat(locations, len(directions), axis=0)
-        axes = np.tile(directions, (len(locations), 1))
-        return self.score(poses_looking_along(at, axes)).reshape(len(locations), len(directions))
+        return self.score_and_count(locations, directions)[0]
 
     def score_and_count(self, locations: Float, directions: Float) -> tuple[Float, NDArray[Any] | None]:
         """Return `score_directions` and the landmarks in view, (L, D) each; None where the method does not count them."""
-        return self.score_directions(locations, directions), None
+        at = np.repeat(locations, len(directions), axis=0)
+        axes = np.tile(directions, (len(locations), 1))
+        return self.score(poses_looking_along(at, axes)).reshape(len(locations), len(directions)), None
 
     def report(self, cam_from_world: Float) -> Views:
         """Score poses (B, 3, 4) and report what else is known of their views."""

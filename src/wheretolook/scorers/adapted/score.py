@@ -120,13 +120,9 @@ class AdaptedScorer(Scorer):
         """Return probabilities (B,) in [0, 1]."""
         return self._adapted(self.base.score(cam_from_world))
 
-    def score_directions(self, locations: Float, directions: Float) -> Float:
-        """Return probabilities (L, D); see `SetScorer.score_directions`."""
-        return self._adapted(self.base.score_directions(check_locations(locations), directions))
-
     def score_and_count(self, locations: Float, directions: Float) -> tuple[Float, NDArray[Any] | None]:
         """See `SetScorer.score_and_count`."""
-        scores, counts = self.base.score_and_count(locations, directions)
+        scores, counts = self.base.score_and_count(check_locations(locations), directions)
         return self._adapted(scores), counts
 
     def report(self, cam_from_world: Float) -> Views:

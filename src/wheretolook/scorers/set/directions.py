@@ -113,12 +113,11 @@ class BatchedDirections:
         return network
 
     def _reach(self) -> Float:
-        """Return the largest positions in an image (2,), across and down: those of its border, if they are finite."""
+        """Return the largest positions in an image (2,), across and down, if they are finite."""
         camera = self.localization_map.camera
         along = np.linspace(0, 1, 65)
-        border = np.concatenate([np.column_stack(side) for end in (0 * along, 0 * along + 1)
-                                 for side in ((along, end), (end, along))])  # fmt: skip
-        rays = camera.unproject(border * (camera.width, camera.height))
+        pixels = np.stack(np.meshgrid(along * camera.width, along * camera.height), axis=-1)
+        rays = camera.unproject(pixels.reshape(-1, 2))
         if not (rays[:, 2] > 0.01).all():  # or NaN
             return np.full(2, 1e30)
         # between these points a curved side may reach a little farther
@@ -175,7 +174,7 @@ class BatchedDirections:
             described.open, described.layers = empty(number, width, dtype=wp.uint8), empty(number, 6 * width)
         wp.launch(self._describe, number, [self.network, nearby.offsets, nearby.rows], [described], device=device)
         numbers: Any = (listed.n_visible, listed.starts, listed.lengths)
-        uploaded: list[Any] = [wp.array(values, device=device) for values in numbers]
+        uploaded: Any = [wp.array(values, device=device) for values in numbers]
         visible, starts, lengths = uploaded
         none: Any = wp.full((len(views), CELLS**2), float(self.lanes == 1), dtype=wp.float32, device=device)
         sums, cells = empty(len(views), self.lanes, dtype=directions_kernel.Sums), empty(len(views))

@@ -311,18 +311,14 @@ class SetScorer(LandmarkScorer):
         log_odds: Tensor = self.network.matchability(values)
         return log_odds
 
-    def score_directions(self, locations: Float, directions: Float) -> Float:
-        """Return probabilities (L, D); where many landmarks are visible, from another sample than `score`."""
-        return self._of_directions(locations, directions)[0]
-
     def score_and_count(self, locations: Float, directions: Float) -> tuple[Float, NDArray[Any] | None]:
-        """See `Scorer.score_and_count`; a camera of COLMAP only estimates the number."""
-        scores, counts = self._of_directions(locations, directions)
-        return scores, None if isinstance(self.localization_map.camera, ColmapCamera) else counts
+        """See `Scorer.score_and_count`; where many landmarks are visible, scores are of another sample than `score`'s.
 
-    def _of_directions(self, locations: Float, directions: Float) -> tuple[Float, Float]:
+        Of a camera of COLMAP the number is only estimated.
+        """
         if self._batched is None or not np.array_equal(self._batched.directions, directions):
             self._batched = BatchedDirections(
                 self.localization_map, self.trained, directions, MAX_LANDMARKS, self.accuracy
             )
-        return self._batched.score(locations)
+        scores, counts = self._batched.score(locations)
+        return scores, None if isinstance(self.localization_map.camera, ColmapCamera) else counts

@@ -219,7 +219,9 @@ def on_hull_plain(directions: Float, lengths: Float, margin: float = 0.0) -> NDA
     """As `on_hull`, by the hull of all points."""
     points = directions * lengths[:, None]
     hull = ConvexHull(np.concatenate([points, np.zeros((1, 3)), _missing_axes(directions)]))
-    on = np.isin(np.arange(len(points)), hull.vertices)
+    on = np.zeros(len(hull.points), dtype=bool)
+    on[hull.vertices] = True
+    on = on[: len(points)]
     if margin > 0:
         inner = np.flatnonzero(~on)
         on[inner] = hull_length(hull, directions[inner]) - lengths[inner] <= margin

@@ -12,7 +12,6 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from wheretolook.dataset.config import Accuracy
-from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.poses import Float, check_locations, rotation_looking_along
 from wheretolook.inputs.localization_map import LocalizationMap
 from wheretolook.mapping.landmarks import MAP_ATTRIBUTES
@@ -113,15 +112,17 @@ class BatchedDirections:
         network.reach = wp.vec2(*self._reach())
         return network
 
-    def _reach(self) -> tuple[float, float]:
-        """Return the largest positions in an image, across and down; of other cameras than pinholes they exceed all."""
+    def _reach(self) -> Float:
+        """Return the largest positions in an image (2,), across and down: those of its border, if they are finite."""
         camera = self.localization_map.camera
-        if not isinstance(camera, PinholeCamera):
-            return 1e30, 1e30
-        return (
-            max(camera.cx, camera.width - camera.cx) / camera.fx,
-            max(camera.cy, camera.height - camera.cy) / camera.fy,
-        )
+        along = np.linspace(0, 1, 65)
+        border = np.concatenate([np.column_stack(side) for end in (0 * along, 0 * along + 1)
+                                 for side in ((along, end), (end, along))])  # fmt: skip
+        rays = camera.unproject(border * (camera.width, camera.height))
+        if not (rays[:, 2] > 0.01).all():  # or NaN
+            return np.full(2, 1e30)
+        # between these points a curved side may reach a little farther
+        return 1.01 * np.abs(rays[:, :2] / rays[:, 2:]).max(axis=0)
 
     def score(self, locations: Float) -> tuple[Float, Float]:
         """Return scores and landmarks in view (L, D) at locations (L, 3) m; a PoseError if one is not finite.

@@ -17,8 +17,6 @@ import warp as wp
 
 from wheretolook.scorers.set.network import CELLS, N_EXPECTED
 
-OPTIONS = {"enable_backward": False, "cpu_compiler_flags": "-march=native -ffp-contract=fast"}
-
 Mapped = wp.types.vector(7, wp.float32)
 Sums = wp.types.vector(N_EXPECTED, wp.float32)
 LOG_320 = wp.constant(5.768321)  # see `bearing_precision`
@@ -185,6 +183,9 @@ LOG_ODDS_ALL = """
 def kernels(width: int, lanes: int) -> tuple[wp.Kernel, wp.Kernel]:
     """Return `describe_kernel` and `sum_kernel` for layers of `width` units, a multiple of 8; with lanes those of a GPU."""
     describe_text, log_odds_text = (DESCRIBE, LOG_ODDS) if lanes == 1 else (DESCRIBE_ALL, LOG_ODDS_ALL)
+    module = f"{__name__}.{width}x{lanes}"  # one for both: each takes seconds to compile
+    options = {"enable_backward": False, "cpu_compiler_flags": "-march=native -ffp-contract=fast"}
+    wp.set_module_options(options, module)
 
     @wp.func_native(f"const int W = {width};{describe_text}")
     def describe(
@@ -194,7 +195,7 @@ def kernels(width: int, lanes: int) -> tuple[wp.Kernel, wp.Kernel]:
     @wp.func_native(f"const int W = {width};{log_odds_text}")
     def log_odds_of(network: Matchability, described: Described, entry: wp.int32, at: wp.vec2) -> wp.float32: ...
 
-    @wp.kernel(module="unique", module_options=OPTIONS)
+    @wp.kernel(module=module)
     def describe_kernel(
         network: Matchability, offsets: wp.array[wp.vec3], rows: wp.array[wp.int32], described: Described
     ):
@@ -212,7 +213,7 @@ def kernels(width: int, lanes: int) -> tuple[wp.Kernel, wp.Kernel]:
         described.n_open[entry] = describe(network, described, entry, row, values)
         described.terms[entry] = terms_of(offset, size_ratio, angle, network.pixel_angle, mapped)
 
-    @wp.kernel(module="unique", module_options=OPTIONS)
+    @wp.kernel(module=module)
     def sum_kernel(
         network: Matchability,
         described: Described,

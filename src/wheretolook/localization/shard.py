@@ -7,6 +7,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
+from multiprocessing import current_process
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +32,7 @@ from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.scenes.loading import load_mesh
 from wheretolook.utils.devices import in_threads, run_halving
 from wheretolook.utils.errors import WhereToLookError, WorkerError
-from wheretolook.utils.processes import WorkerPool, cores, worker_number
+from wheretolook.utils.processes import WorkerPool, cores
 
 GPU_BATCH = 256
 """Viewpoints of 640 x 480 that a GPU labels at a time: poses take as many launches for one."""
@@ -140,7 +141,7 @@ class LabelledShard:
 class ShardWorker:
     """Labels shards in this process; renderer and map stay loaded until a shard of another scene comes.
 
-    Its number among its engine's workers, from 0, selects the GPU.
+    Its number selects the GPU: those of a pool follow one another.
     """
 
     def __init__(self, number: int = 0) -> None:
@@ -195,7 +196,8 @@ def run_local(shards: Sequence[Shard], workers: int) -> Iterator[tuple[Shard, La
 
 def _label_shard(shard: Shard) -> LabelledShard:
     global _worker
-    _worker = _worker or ShardWorker(worker_number())
+    number = current_process().name.rpartition("-")[2]  # among those that the parent has started
+    _worker = _worker or ShardWorker(int(number))
     return _worker.label(shard.job, shard.rows)
 
 

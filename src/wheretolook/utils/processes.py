@@ -138,11 +138,8 @@ class WorkerPool:
     def _submit(self, function: Callable[[Item], Result], item: Item) -> Future[Result]:
         if self._executor is None:
             context = multiprocessing.get_context("spawn")
-            numbers = context.SimpleQueue()
-            for number in range(self.workers):
-                numbers.put(number)
             stopped, self._stop = context.Pipe(duplex=False)
-            start = (numbers, stopped, in_main_thread())
+            start = (stopped, in_main_thread())
             self._executor = ProcessPoolExecutor(self.workers, context, _start_worker, start)
         with ignoring_sigint():
             return self._executor.submit(function, item)
@@ -215,27 +212,17 @@ def in_main_thread() -> bool:
     return threading.current_thread() is threading.main_thread()
 
 
-_number = 0
-
-
-def worker_number() -> int:
-    """Return the number of this worker process in its pool, from 0."""
-    return _number
-
-
-def _start_worker(numbers: Any, stopped: Connection, started_by_main_thread: bool) -> None:
+def _start_worker(stopped: Connection, started_by_main_thread: bool) -> None:
     """Initialize a worker process.
 
     On Linux the kernel kills it when the thread that started it ends, even inside a compiled function that holds the
     interpreter lock (prctl(2)); that is used only if this thread is the main thread, which lives as long as its
     process. Elsewhere a thread ends the worker.
     """
-    global _number
     if started_by_main_thread:
         with suppress(OSError, AttributeError, TypeError):  # TypeError: Windows has no library without a name
             ctypes.CDLL(None).prctl(1, signal.SIGKILL)  # PR_SET_PDEATHSIG of sys/prctl.h
     threading.Thread(target=_exit_when_stopped, args=(stopped,), daemon=True).start()
-    _number = numbers.get()
     on_sigterm(signal.SIG_DFL)
     import cv2
 

@@ -34,8 +34,8 @@ from wheretolook.utils.devices import in_threads, run_halving
 from wheretolook.utils.errors import WhereToLookError, WorkerError
 from wheretolook.utils.processes import WorkerPool, cores
 
-GPU_BATCH = 256
-"""Viewpoints of 640 x 480 that a GPU labels at a time: poses take as many launches for one."""
+GPU_BATCH = 128
+"""Viewpoints of 640 x 480 that a GPU labels at a time: more take more memory, and no clearly less time."""
 
 _END = object()
 """Marks the end of the items."""
@@ -233,7 +233,7 @@ def label_rows(
             for start in range(0, len(part), size):
                 batch = part[start : start + size]
                 batches.append(_Batch(shown, camera, batch, true_poses[batch], [drawn[row] for row in batch if drawn]))
-    labeller = _BatchLabeller(localizer, cores() if job.on_gpu else 1)
+    labeller = _BatchLabeller(localizer)
     steps = [
         Step("render", labeller.render),
         Step("extract", labeller.extract),
@@ -279,9 +279,8 @@ class _Batch:
 class _BatchLabeller:
     """Steps by which a batch of views is labelled; the batch goes with its images, keypoints and matches."""
 
-    def __init__(self, localizer: Localizer, threads: int) -> None:
+    def __init__(self, localizer: Localizer) -> None:
         self.localizer = localizer
-        self.threads = threads  # that change the appearance of images
 
     def render(self, batch: _Batch) -> tuple[_Batch, Sequence[NDArray[np.uint8]]]:
         extractor = self.localizer.extractor
@@ -289,7 +288,7 @@ class _BatchLabeller:
         views = np.arange(len(batch.rows))
         if on_device and isinstance(batch.camera, PinholeCamera):
             return batch, run_halving(lambda some: _images_on_device(batch, some), views)
-        return batch, run_halving(lambda some: _images(batch, some, self.threads), views)
+        return batch, run_halving(lambda some: _images(batch, some), views)
 
     def extract(self, rendered: tuple[_Batch, Sequence[NDArray[np.uint8]]]) -> tuple[_Batch, list[Keypoints]]:
         batch, images = rendered
@@ -310,7 +309,7 @@ def _images_on_device(batch: _Batch, views: NDArray[np.int64]) -> list[torch.Ten
     return [image for block in colors for image in wp.to_torch(block)]
 
 
-def _images(batch: _Batch, views: NDArray[np.int64], threads: int) -> NDArray[np.uint8]:
+def _images(batch: _Batch, views: NDArray[np.int64]) -> NDArray[np.uint8]:
     """Render some views (V,) of a batch as images (V, H, W, 3), with their appearances if these are drawn."""
     seen = batch.renderer.render(batch.camera, batch.cam_from_world[views])
     if not batch.drawn:
@@ -320,7 +319,7 @@ def _images(batch: _Batch, views: NDArray[np.int64], threads: int) -> NDArray[np
     def changed(n: int) -> NDArray[np.uint8]:
         return batch.drawn[views[n]].apply(seen.rgb[n], batch.camera, depths[n])
 
-    return np.stack([*in_threads(changed, range(len(views)), threads)])
+    return np.stack([*in_threads(changed, range(len(views)), 1 if batch.renderer.device == "cpu" else cores())])
 
 
 def _is_changed(table: pd.DataFrame, seed: int) -> NDArray[np.bool_]:

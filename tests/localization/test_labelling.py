@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
@@ -18,6 +19,7 @@ from wheretolook.features.extractor import ExtractorConfig, Keypoints
 from wheretolook.features.matches import Matches
 from wheretolook.geometry.camera import ColmapCamera, PinholeCamera
 from wheretolook.geometry.poses import pose_error, transform
+from wheretolook.localization import shard
 from wheretolook.localization.config import LabelConfig, LocalizerConfig
 from wheretolook.localization.labeller import MANIFEST, LabelTask, label_scenes
 from wheretolook.localization.localizer import Localizer
@@ -164,6 +166,15 @@ def test_one_process_owns_a_gpu_if_all_steps_run_there(room, there, place, optio
     job = replace(room.job, device=place, **options)
     assert job.on_gpu == there
     assert job.processes == (1 if there else cores())
+
+
+@pytest.mark.parametrize("name", ["SpawnProcess-3", "SpawnProcess-1:3"])
+def test_processes_of_a_pool_select_gpus_by_their_number(name, monkeypatch):
+    """Also where the parent of the pool is itself a process of another."""
+    monkeypatch.setattr(shard, "_worker", None)
+    monkeypatch.setattr(shard, "current_process", lambda: SimpleNamespace(name=name))
+    monkeypatch.setattr(shard.ShardWorker, "label", lambda self, job, rows: self.number)
+    assert shard._label_shard(shard.Shard(None, None, None)) == 3
 
 
 def test_views_of_several_cameras_are_labelled_as_each_alone(room):

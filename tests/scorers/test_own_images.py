@@ -22,6 +22,7 @@ from wheretolook.mapping.landmarks import Landmarks, load_colmap_landmarks
 from wheretolook.mapping.map import Map
 from wheretolook.robot.export import export_robot
 from wheretolook.robot.wheretolook_robot import RobotScorer
+from wheretolook.scorers.adapted.score import AdaptedNetwork
 from wheretolook.scorers.set.network import SetNetwork
 from wheretolook.scorers.set.score import OFFSETS, detection_offset, for_map
 from wheretolook.scorers.weights import load_scorer
@@ -39,6 +40,13 @@ class SeesHalf(OcclusionModel):
 
     def unoccluded(self, locations, points):
         return np.tile(np.arange(len(points)) % 2 == 0, (len(locations), 1))
+
+
+class SeesNothing(OcclusionModel):
+    """Hides all landmarks, as a mesh in another frame may."""
+
+    def unoccluded(self, locations, points):
+        return np.zeros((len(locations), len(points)), dtype=bool)
 
 
 def bundled():
@@ -112,6 +120,11 @@ def test_the_offset_is_that_of_the_rate_of_detection(p_detect):
 def test_the_offset_is_bounded():
     assert detection_offset(constant_network(), observed_map(0.06, n=10_000))[0] == OFFSETS[0]
     assert detection_offset(constant_network(), observed_map(0.97))[0] == OFFSETS[-1]
+
+
+def test_occluded_landmarks_determine_no_standard_error():
+    localization_map = replace(observed_map(0.6, n=500), occlusion=SeesNothing())
+    assert detection_offset(constant_network(), localization_map) == (OFFSETS[-1], None)
 
 
 def test_few_images_do_not_determine_it():
@@ -188,6 +201,25 @@ def test_all_scorers_of_a_map_use_it(tmp_path):
     report.in_frame(localization_map.frame).save(tmp_path / "views.json")
     assert json.loads((tmp_path / "views.json").read_text())["calibration"] == calibration
     assert calibration["detection_offset"] == scorer.trained.of_map.detection_offset
+
+
+def test_adapted_weights_state_what_they_store(tmp_path):
+    localization_map = observed_map(0.6)
+    base = for_map(bundled(), localization_map)
+    network = AdaptedNetwork(base.network, base.scale, base.offset, 0, base.of_map.error_scale)
+    path = tmp_path / "adapted.safetensors"
+    TrainedNetwork("adapted", network, base.camera, 1.0, 0.0, base.training_range).save(path, {"scene": "room"})
+    report = load_scorer(localization_map, path).report(localization_map.mapping_poses[:1])
+    assert report.of_map.describe() == f"errors of poses as of keypoints of {base.of_map.error_scale:.2f} px"
+    report = replace(report, waypoint_id=("a",), rank=np.ones(1, dtype=np.int64))
+    report.in_frame(localization_map.frame).save(tmp_path / "views.json")
+
+    def refuse(constant):
+        raise ValueError(f"{constant} is not JSON")
+
+    calibration = json.loads((tmp_path / "views.json").read_text(), parse_constant=refuse)["calibration"]
+    assert calibration.pop("error_scale") == pytest.approx(base.of_map.error_scale)
+    assert set(calibration.values()) == {None}
 
 
 def test_landmarks_without_an_image_are_those_of_the_smaller_model(tmp_path):

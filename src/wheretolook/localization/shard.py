@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -197,7 +198,7 @@ def run_local(shards: Sequence[Shard], workers: int) -> Iterator[tuple[Shard, La
 
 def _label_shard(shard: Shard) -> LabelledShard:
     global _worker
-    number = current_process().name.rpartition("-")[2]  # among those that the parent has started
+    number = re.split("[-:]", current_process().name)[-1]  # among those that the parent has started
     _worker = _worker or ShardWorker(int(number))
     return _worker.label(shard.job, shard.rows)
 

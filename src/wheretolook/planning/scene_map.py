@@ -125,10 +125,9 @@ def _score_and_count(
             ranked[rows] = np.argsort(-values, axis=1, kind="stable")
             scores[rows] = values
             n_visible[rows] = counts
-            some = checked[(checked >= begin) & (checked < begin + block)]
-            if len(some):  # warns of views out of range
-                scorer.score(poses_looking_along(locations[some], directions[ranked[some, 0]]))
             bar.update(len(values))
+    # warns if too many of these views are out of range
+    scorer.score(poses_looking_along(locations[checked], directions[ranked[checked, 0]]))
     return ranked, scores, n_visible
 
 

@@ -7,7 +7,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from math import isfinite, nan
+from math import isfinite
 from pathlib import Path
 from typing import Any, Generic, Self, TypeVar
 
@@ -226,24 +226,28 @@ NetworkT = TypeVar("NetworkT", bound=StoredNetwork)
 class MapCalibration:
     """Errors of poses and probabilities of detection on a map of photographs, by its own images.
 
-    Standard errors are over held-out blocks of the images, None where the images determine nothing.
+    Standard errors are over held-out blocks of the images, None where the images determine nothing. Adapted weights store
+    the scale alone; their network contains the offset.
     """
 
     error_scale: float  # pixels: the map's keypoint noise times a factor by its tracks
     log_error_scale_error: float | None = None
-    error_spread: float = nan  # standard deviation of the log errors of positions, the same for all maps
-    detection_offset: float = 0.0  # of the log-odds of detection
+    error_spread: float | None = None  # standard deviation of the log errors of positions, the same for all maps
+    detection_offset: float | None = None  # of the log-odds of detection
     detection_offset_error: float | None = None
 
     def describe(self) -> str:
         """State the numbers for a summary."""
-        scale = f"errors of poses as of keypoints of {self.error_scale:.2f} px"
+        text = f"errors of poses as of keypoints of {self.error_scale:.2f} px"
         if self.log_error_scale_error is not None:
-            scale += f" (standard error {self.log_error_scale_error:.0%})"
-        offset = f"log-odds of detection {self.detection_offset:+.2f}"
+            text += f" (standard error {self.log_error_scale_error:.0%})"
+        if self.error_spread is not None:
+            text += f", deviation of their logs {self.error_spread:.2f}"
+        if self.detection_offset is not None:
+            text += f"; log-odds of detection {self.detection_offset:+.2f}"
         if self.detection_offset_error is not None:
-            offset += f" (standard error {self.detection_offset_error:.2f})"
-        return f"{scale}, deviation of their logs {self.error_spread:.2f}; {offset}"
+            text += f" (standard error {self.detection_offset_error:.2f})"
+        return text
 
 
 @dataclass(frozen=True, eq=False)

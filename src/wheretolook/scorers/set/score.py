@@ -212,7 +212,9 @@ def detection_offset(network: SetNetwork, localization_map: LocalizationMap) -> 
     p = (odds + offset).sigmoid()
     slope = float((each * p * (1 - p)).sum())  # of the sum of all surpluses
     n = len(lengths)
-    return offset, surpluses(offset).std().item() * sqrt(n) / slope if n > 1 else None
+    if n == 1 or slope == 0:  # where all landmarks are occluded
+        return offset, None
+    return offset, surpluses(offset).std().item() * sqrt(n) / slope
 
 
 MAX_LANDMARKS = 1024

@@ -13,6 +13,7 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
+import matplotlib as mpl
 import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
@@ -21,7 +22,7 @@ from common import ROOM_M, options, room_map, seconds_of, show, use_one_thread, 
 from wheretolook.features.extractor import quantize_descriptors
 from wheretolook.features.matches import match
 from wheretolook.features.matching import DescriptorIndex, DescriptorMatcher, has_index
-from wheretolook.figures.floor_plan import save_figure
+from wheretolook.figures.floor_plan import RC
 from wheretolook.geometry.camera import PinholeCamera
 from wheretolook.geometry.lattices import fibonacci_sphere
 from wheretolook.geometry.poses import rotation_looking_along
@@ -116,6 +117,7 @@ def main():
 
 def draw(table, path):
     """Draw times by the number of landmarks, and by the number of locations, on logarithmic axes."""
+    mpl.rcParams.update(RC)
     figure, axes = plt.subplots(1, 2, figsize=(8, 3.2), layout="constrained")
     for axis, names, label in ((axes[0], (MATCHED, COUNTED), "landmarks"), (axes[1], (SCORED,), "locations")):
         for name in names:
@@ -128,7 +130,7 @@ def draw(table, path):
     if len(by_index):
         first = by_index.iloc[0]
         axes[0].annotate("index", (first["size"], first["median_s"]), (0, -14), textcoords="offset points", ha="center")
-    save_figure(figure, path)
+    figure.savefig(path, pil_kwargs={"lossless": True})
 
 
 if __name__ == "__main__":

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -32,12 +32,8 @@ TRIALS = 1000
 """RANSAC trials of a round, after which a view may be finished."""
 
 
-class EstimatedPose(NamedTuple):
-    """A pose (3, 4), the rows of the landmarks that agree with it, and its support (`estimation.Hypothesis`)."""
-
-    pose: Float
-    rows: NDArray[np.int64]
-    support: float
+EstimatedPose = tuple[Float, NDArray[np.int64]]
+"""A pose (3, 4), and the rows of the landmarks that agree with it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -204,8 +200,7 @@ class BatchedEstimator:
         best = order[np.arange(len(order)), np.where(strong, preference, -np.inf).argmax(1)]
         in_world = poses_from(poses, -self.origin)
         return [
-            EstimatedPose(in_world[n, k], rows[n, k, inliers[n, k]], support[n, k]) if support[n, k] else None
-            for n, k in enumerate(best.tolist())
+            (in_world[n, k], rows[n, k, inliers[n, k]]) if support[n, k] else None for n, k in enumerate(best.tolist())
         ]
 
     def _unique_supports(self, matches: MatchBatch, poses: Tensor, rows: Tensor, inliers: Tensor) -> Tensor:

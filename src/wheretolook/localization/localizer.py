@@ -270,7 +270,7 @@ class Localizer:
             if len(rows) < least:
                 results.append(Localization(TOO_FEW_MATCHES, None, rows[:0], rows, pixels))
             else:
-                first, best = (None if pose is None else pose[:2] for pose in next(estimated))
+                first, best = next(estimated)
                 of_first = self._result(first, pixels, rows)
                 results.append(self._result(best, pixels, rows, of_first) if several else of_first)
         return results

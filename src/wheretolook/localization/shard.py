@@ -30,12 +30,12 @@ from wheretolook.mapping.landmarks import Landmarks
 from wheretolook.rendering.appearance import Appearance
 from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.scenes.loading import load_mesh
-from wheretolook.utils.devices import in_threads, run_halving
+from wheretolook.utils.devices import run_halving
 from wheretolook.utils.errors import WhereToLookError, WorkerError
 from wheretolook.utils.processes import WorkerPool, cores
 
-GPU_BATCH = 256
-"""Viewpoints of 640 x 480 that a GPU labels at a time: poses take as many launches for one."""
+GPU_BATCH = 128
+"""Viewpoints of 640 x 480 that a GPU labels at a time: more take more memory, and no clearly less time."""
 
 _END = object()
 """Marks the end of the items."""
@@ -109,9 +109,10 @@ class SceneJob:
 
     @property
     def on_gpu(self) -> bool:
-        """Whether all steps run on a GPU."""
+        """Whether all steps run on a GPU; appearances are those of a core, 0.3 s for two megapixels."""
         pinholes = all(isinstance(camera, PinholeCamera) for camera in (self.camera, *dict(self.cameras).values()))
-        return self.device != "cpu" and self.extractor.method != "colmap" and pinholes
+        on_cores = self.device == "cpu" or self.extractor.method == "colmap" or self.appearance > 0
+        return pinholes and not on_cores
 
     @property
     def processes(self) -> int:
@@ -233,7 +234,7 @@ def label_rows(
             for start in range(0, len(part), size):
                 batch = part[start : start + size]
                 batches.append(_Batch(shown, camera, batch, true_poses[batch], [drawn[row] for row in batch if drawn]))
-    labeller = _BatchLabeller(localizer, cores() if job.on_gpu else 1)
+    labeller = _BatchLabeller(localizer)
     steps = [
         Step("render", labeller.render),
         Step("extract", labeller.extract),
@@ -279,9 +280,8 @@ class _Batch:
 class _BatchLabeller:
     """Steps by which a batch of views is labelled; the batch goes with its images, keypoints and matches."""
 
-    def __init__(self, localizer: Localizer, threads: int) -> None:
+    def __init__(self, localizer: Localizer) -> None:
         self.localizer = localizer
-        self.threads = threads  # that change the appearance of images
 
     def render(self, batch: _Batch) -> tuple[_Batch, Sequence[NDArray[np.uint8]]]:
         extractor = self.localizer.extractor
@@ -289,7 +289,7 @@ class _BatchLabeller:
         views = np.arange(len(batch.rows))
         if on_device and isinstance(batch.camera, PinholeCamera):
             return batch, run_halving(lambda some: _images_on_device(batch, some), views)
-        return batch, run_halving(lambda some: _images(batch, some, self.threads), views)
+        return batch, run_halving(lambda some: _images(batch, some), views)
 
     def extract(self, rendered: tuple[_Batch, Sequence[NDArray[np.uint8]]]) -> tuple[_Batch, list[Keypoints]]:
         batch, images = rendered
@@ -310,17 +310,13 @@ def _images_on_device(batch: _Batch, views: NDArray[np.int64]) -> list[torch.Ten
     return [image for block in colors for image in wp.to_torch(block)]
 
 
-def _images(batch: _Batch, views: NDArray[np.int64], threads: int) -> NDArray[np.uint8]:
+def _images(batch: _Batch, views: NDArray[np.int64]) -> NDArray[np.uint8]:
     """Render some views (V,) of a batch as images (V, H, W, 3), with their appearances if these are drawn."""
     seen = batch.renderer.render(batch.camera, batch.cam_from_world[views])
     if not batch.drawn:
         return seen.rgb
-    depths = seen.depth_m
-
-    def changed(n: int) -> NDArray[np.uint8]:
-        return batch.drawn[views[n]].apply(seen.rgb[n], batch.camera, depths[n])
-
-    return np.stack([*in_threads(changed, range(len(views)), threads)])
+    rendered = zip(views, seen.rgb, seen.depth_m, strict=True)
+    return np.stack([batch.drawn[view].apply(rgb, batch.camera, depth_m) for view, rgb, depth_m in rendered])
 
 
 def _is_changed(table: pd.DataFrame, seed: int) -> NDArray[np.bool_]:

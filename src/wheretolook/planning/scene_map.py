@@ -109,7 +109,8 @@ def _score_and_count(
     n_visible = np.empty(ranked.shape, dtype=np.uint32)
     # enough views at once to fill a GPU, few enough for the progress bar to move
     block = max(1, (1 << 14 if device == "cpu" else 1 << 18) // len(directions))
-    checked = spread_rows(len(locations), 1000)
+    # fewer where there are very many landmarks: each is tested from each of them on the host
+    checked = spread_rows(len(locations), max(10, min(1000, (1 << 28) // len(points))))
     counting = SurveyOptions(keep=1, keep_occlusion=False, device=device)
     on_device = None
     with tqdm(total=len(locations), desc=progress, unit="voxel", disable=progress is None) as bar:

@@ -298,10 +298,8 @@ class FrustumLister(FrustumCounter):
         camera = self.camera
         if not isinstance(camera, ColmapCamera):
             return ListedViews(in_view.astype(np.float32), starts, lengths, entries, image)
-        on_host, at = entries.numpy(), image.numpy()
-        if (lengths < rooms).any():
-            used = np.repeat(starts + lengths, rooms) > np.arange(rooms.sum())
-            on_host, at = on_host[used], at[used]
+        used = np.repeat(starts + lengths, rooms) > np.arange(rooms.sum())
+        on_host = entries.numpy()[used]
 
         def sees(view: NDArray[np.int64], rows: NDArray[np.int32]) -> NDArray[np.bool_]:
             return camera_sees(camera, self.rotations, views[view, 1], candidates.offsets.numpy()[rows])
@@ -309,7 +307,7 @@ class FrustumLister(FrustumCounter):
         kept, ends = decided(on_host, np.concatenate([[0], np.cumsum(lengths)]), sees)
         share = np.diff(ends) / np.maximum(lengths, 1)
         there: Any = wp.array(on_host[kept], dtype=wp.int32, device=self.device)
-        seen: Any = wp.array(at[kept], dtype=wp.vec2, device=self.device)
+        seen: Any = wp.array(image.numpy()[used][kept], dtype=wp.vec2, device=self.device)
         return ListedViews((share * in_view).astype(np.float32), ends[:-1], np.diff(ends), there, seen)
 
     def _launch(

@@ -135,18 +135,19 @@ class BatchedDirections:
         if self.points.device == "cpu":  # blocks are small: each thread has its own
             workers = cores()
             step = min((1 << 17) // max(1, n_points), -(-len(locations) // (4 * workers)))
-        else:  # many views occupy a GPU; what is unoccluded takes at most 14 times this memory
+        else:  # 30,000 bytes for a view's list and cells; what is unoccluded takes at most 14 times all of it
             required = self.lister.bytes_per_location(n_points) + 30_000 * len(self.directions)
             memory = wp.get_device(self.points.device).total_memory // 32
             step = min(memory // required, self.lister.max_locations(n_points))
 
         def work(rows: slice) -> None:
-            torch.set_num_threads(1 if workers > 1 else threads)
+            torch.set_num_threads(1)
             found[:, rows, self.order] = self._score(locations[rows])
 
         threads = torch.get_num_threads()
+        step = max(1, step)
         try:
-            blocks = [slice(begin, begin + max(1, step)) for begin in range(0, len(locations), max(1, step))]
+            blocks = [slice(begin, begin + step) for begin in range(0, len(locations), step)]
             list(in_threads(work, blocks, workers))
         finally:
             torch.set_num_threads(threads)

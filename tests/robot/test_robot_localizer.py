@@ -62,7 +62,7 @@ class ByPose:
     scorer: Scorer
 
     def score_directions(self, locations, directions):
-        return Scorer.score_directions(self.scorer, locations, directions)
+        return Scorer.score_and_count(self.scorer, locations, directions)[0]
 
 
 def described():

@@ -311,7 +311,8 @@ def describe_type(kind: str) -> str:
     if NUMBERS.match(kind):
         return "numbers" if "..." in kind else f"{kind.count(',') + 1} numbers"
     needed = {"bool": "true or false", "int": "a whole number", "float": "a number"}
-    return next((text for name, text in needed.items() if name in kind), "")
+    named = re.findall("'(.*?)'", kind) if "Literal[" in kind else []
+    return ", or ".join([*(text for name, text in needed.items() if name in kind)][:1] + named)
 
 
 def full_name(command: Any, name: str) -> str:

@@ -15,7 +15,7 @@ from wheretolook.mapping.colmap_model import colmap_poses
 from wheretolook.mapping.config import MIN_TRIANGULATION_ANGLE_DEG, MapConfig
 from wheretolook.mapping.landmarks import Landmarks, load_colmap_landmarks
 from wheretolook.mapping.rendered_map import build_map, plan_walk
-from wheretolook.mapping.triangulation import choose_pairs, estimate_poses, shrink_depth, surface_overlap
+from wheretolook.mapping.triangulation import choose_pairs, estimate_poses, posed_model, shrink_depth, surface_overlap
 from wheretolook.rendering.appearance import Appearance
 from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.utils.errors import MapError
@@ -102,6 +102,14 @@ def test_noisy_poses_are_adjusted_to_those_of_the_walk(built, rng):
         if image.num_points3D > 20
     ]
     assert np.median(errors_m) < 0.02
+
+
+def test_images_that_observe_nothing_keep_their_poses():
+    exact = poses_looking_along(np.zeros((2, 3)), np.eye(3)[:2])
+    model = posed_model(CAMERA, exact)
+    estimate_poses(model)
+    found = [image.cam_from_world().matrix() for _, image in sorted(model.images.items())]
+    assert_allclose(found, exact, atol=1e-12)
 
 
 def test_a_drifting_map_has_an_estimated_camera(room, room_free_space, renderer, tmp_path):

@@ -177,7 +177,7 @@ def _is_finished(shard: Shard) -> bool:
 
 
 def run_ray(shards: Sequence[Shard], address: str = "") -> Iterator[tuple[Shard, LabelledShard]]:
-    """Label shards on a Ray cluster, each on one core and, with a CUDA device, a sixteenth of a GPU.
+    """Label shards on a Ray cluster, each on one core and, with a CUDA device, a GPU or a sixteenth of one.
 
     They are begun in this order and yielded as they are finished. An empty address uses the cluster that this process
     is connected to, or starts one on this machine. Raises what a worker raises, ConfigError if Ray is not installed or
@@ -228,7 +228,9 @@ def _run_on_ray(ray: Any, shards: Sequence[Shard]) -> Iterator[tuple[Shard, Labe
         if shard.job not in files:  # a scene travels to a machine once
             files.clear()
             files[shard.job] = ray.put([path.read_bytes() for path in _files(shard.job).values()])
-        gpus = 1 / 16 if shard.job.device != "cpu" else 0
+        gpus = 1 if shard.job.on_gpu else 1 / 16  # several share the GPU where most steps run on cores
+        if shard.job.device == "cpu":
+            gpus = 0
         running[label.options(num_gpus=gpus).remote(shard.job, files[shard.job], shard.rows)] = shard
 
     try:

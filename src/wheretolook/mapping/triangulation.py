@@ -125,9 +125,11 @@ def triangulate_model(
 def estimate_poses(model: Any) -> None:
     """Adjust poses, focal length and points of a triangulated reconstruction in place, and align it with its old poses.
 
-    Images that observe no point keep their poses.
+    Images that observe no point keep their poses, and so do all images of a model without points.
     """
     images = [image for image in model.images.values() if image.num_points3D]
+    if not images:
+        return
     before = _frames(images)
     options = pycolmap.BundleAdjustmentOptions(print_summary=False, refine_extra_params=False)
     options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1  # some tracks are wrong

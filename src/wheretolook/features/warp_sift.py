@@ -149,12 +149,12 @@ class WarpSift:
 
 def grey_images(images: Sequence[NDArray[np.uint8]] | Sequence[Tensor], device: str) -> Tensor:
     """Convert images (H, W, 3) uint8 of one size to grey (B, H, W) uint8 on a device, exactly as `sift.grey_bitmap`."""
-    if isinstance(images[0], Tensor):
-        rgb = torch.stack([*images])
-    else:
-        for image in images:
+    parts = []
+    for image in images:
+        if not isinstance(image, Tensor):
             check_image(image)
-        rgb = torch.from_numpy(np.asarray(images))
+        parts.append(torch.as_tensor(image))
+    rgb = torch.stack(parts)
     red, green, blue = rgb.to(device).unbind(-1)
     grey = (red * 0.2126 + green * 0.7152 + blue * 0.0722 + 0.5).byte()
     if grey.is_cuda:
@@ -213,7 +213,8 @@ class ScaleSpace:
 
     def fill(self, grey: Tensor) -> None:
         """Compute the scale spaces of images (B, H, W) uint8, B at most `n_images`."""
-        wp.copy(self.grey, wp.from_torch(grey.contiguous()), count=grey.numel())
+        images: Any = wp.from_torch(grey.contiguous())
+        wp.copy(self.grey, images, count=grey.numel())
         if grey.shape[0] != self.filled:
             self.filled = grey.shape[0]
             for command, size in self._commands:

@@ -176,20 +176,15 @@ class BatchedEstimator:
 
         Matches are with the landmarks in rows (V, 1 or S, M).
         """
-        support, inliers = matches.evaluate(poses)
-        arrays = (
-            support,
-            inliers,
-            rows.expand_as(inliers),
-            poses,
-            self._unique_supports(matches, poses, rows, inliers),
-        )
-        support, inliers, rows, poses, unique = (x.cpu().numpy() for x in arrays)
+        values = matches.evaluate(poses)
+        unique_supports = self._unique_supports(matches, poses, rows, values[1])
+        on_device = (*values, rows.expand_as(values[1]), poses, unique_supports)
+        support, inliers, landmarks, local, unique = (x.cpu().numpy() for x in on_device)
         order = np.argsort(-support, kind="stable")
         sorted_support = np.take_along_axis(support, order, 1)
         unique = np.take_along_axis(np.take_along_axis(unique, order[..., None], 1), order[:, None], 2)
-        local = np.take_along_axis(poses, order[..., None, None], 1)
-        error_m, error_deg = pose_error(local[:, :, None], local[:, None])
+        ranked = np.take_along_axis(local, order[..., None, None], 1)
+        error_m, error_deg = pose_error(ranked[:, :, None], ranked[:, None])
         differs = (error_m > 0.5) | (error_deg > 10)  # as by `Hypothesis.differs_from`
         strong = (sorted_support > 0) & (sorted_support >= 0.1 * sorted_support[:, :1])  # others are not chosen
         for k in range(1, strong.shape[1]):
@@ -198,9 +193,10 @@ class BatchedEstimator:
         preference[:, np.eye(len(strong.T), dtype=bool)] = np.inf
         preference = np.where(strong[:, None], preference, np.inf).min(2)  # against the strongest rival
         best = order[np.arange(len(order)), np.where(strong, preference, -np.inf).argmax(1)]
-        in_world = poses_from(poses, -self.origin)
+        in_world = poses_from(local, -self.origin)
         return [
-            (in_world[n, k], rows[n, k, inliers[n, k]]) if support[n, k] else None for n, k in enumerate(best.tolist())
+            (in_world[n, k], landmarks[n, k, inliers[n, k]]) if support[n, k] else None
+            for n, k in enumerate(best.tolist())
         ]
 
     def _unique_supports(self, matches: MatchBatch, poses: Tensor, rows: Tensor, inliers: Tensor) -> Tensor:

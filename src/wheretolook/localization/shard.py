@@ -288,8 +288,9 @@ class _BatchLabeller:
         extractor = self.localizer.extractor
         on_device = extractor.on_gpu and extractor.config.method == "opencv" and not batch.drawn
         views = np.arange(len(batch.rows))
-        if on_device and isinstance(batch.camera, PinholeCamera):
-            return batch, run_halving(lambda some: _images_on_device(batch, some), views)
+        camera = batch.camera
+        if on_device and isinstance(camera, PinholeCamera):
+            return batch, run_halving(lambda some: _images_on_device(batch, camera, some), views)
         return batch, run_halving(lambda some: _images(batch, some), views)
 
     def extract(self, rendered: tuple[_Batch, Sequence[NDArray[np.uint8]]]) -> tuple[_Batch, list[Keypoints]]:
@@ -305,9 +306,9 @@ class _BatchLabeller:
         return self.localizer.estimate_batch(keypoints, matches, batch.camera)
 
 
-def _images_on_device(batch: _Batch, views: NDArray[np.int64]) -> list[torch.Tensor]:
+def _images_on_device(batch: _Batch, camera: PinholeCamera, views: NDArray[np.int64]) -> list[torch.Tensor]:
     """Render some views (V,) of a batch as images (H, W, 3) on the device."""
-    colors = batch.renderer.colors(batch.camera, batch.cam_from_world[views])
+    colors = batch.renderer.colors(camera, batch.cam_from_world[views])
     return [image for block in colors for image in wp.to_torch(block)]
 
 

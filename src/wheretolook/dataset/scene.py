@@ -66,9 +66,11 @@ class ColmapFiles:
 
     def open_map(self, device: str) -> Map:
         """Open the map; a device computes the ambiguity of its landmarks."""
-        from wheretolook.mapping.depth_images import metres_per_unit
+        scale = None
+        if self.depth is not None:
+            from wheretolook.mapping.depth_images import metres_per_unit
 
-        scale = None if self.depth is None else metres_per_unit(self.model, self.depth, self.depth_scale)
+            scale = metres_per_unit(self.model, self.depth, self.depth_scale)
         return Map.open(self.model, self.database, self.frame, self.max_reprojection_error_px, device, scale)
 
 

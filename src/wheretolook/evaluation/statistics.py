@@ -13,7 +13,7 @@ from scipy.optimize import minimize_scalar
 from scipy.special import expit
 
 from wheretolook.geometry.poses import Float
-from wheretolook.scorers.adapted.calibration import finite_log_odds
+from wheretolook.scorers.base import finite_log_odds
 
 
 class ClusterBootstrap:

@@ -24,8 +24,7 @@ from wheretolook.looks.selection import (
 )
 from wheretolook.planning.config import PathConfig, StopConfig
 from wheretolook.planning.routes import Stop, turning_deg
-from wheretolook.scorers.adapted.calibration import finite_log_odds
-from wheretolook.scorers.base import Scorer
+from wheretolook.scorers.base import Scorer, finite_log_odds
 from wheretolook.scorers.registry import is_probability
 from wheretolook.utils.errors import ConfigError, PlanningError
 

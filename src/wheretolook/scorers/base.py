@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
+from scipy.special import logit
 
 from wheretolook.geometry.camera import Camera, ColmapCamera, describe_camera
 from wheretolook.geometry.poses import Float, check_poses, poses_looking_along
@@ -170,3 +171,8 @@ def same_field_of_view(trained: Camera, camera: Camera) -> bool:
         return False
     spans = [(c.width / c.fx, c.height / c.fy, c.cx / c.width, c.cy / c.height) for c in (trained, camera)]
     return bool(np.allclose(spans[0], spans[1], rtol=1e-3, atol=0))
+
+
+def finite_log_odds(probability: ArrayLike, margin: float) -> NDArray[np.float64]:
+    """Return log-odds (...,) of probabilities (...,) in [0, 1], clipped to `margin` .. 1 - `margin` so that they are finite."""
+    return np.asarray(logit(np.clip(probability, margin, 1 - margin)))

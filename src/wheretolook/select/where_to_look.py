@@ -15,10 +15,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from wheretolook.dataset.config import ACCURACY, Accuracy
 from wheretolook.dataset.scene import ColmapFiles, Scene
-from wheretolook.extend.audit import Audit
 from wheretolook.extend.config import TargetOptions, check_extension
 from wheretolook.extend.places import drawn_views, free_places, photograph_candidates, pitches_within, places_at_heights
-from wheretolook.extend.plan import Extension, Planner
 from wheretolook.geometry.camera import Camera, PinholeCamera, describe_camera
 from wheretolook.geometry.camera_files import read_camera
 from wheretolook.geometry.lattices import Lattice, direction_lattice
@@ -43,6 +41,8 @@ from wheretolook.utils.errors import CameraError, ConfigError, MapError, MapWarn
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from wheretolook.extend.audit import Audit
+    from wheretolook.extend.plan import Extension
     from wheretolook.select.image_localizer import Image, ImageLocalizer
     from wheretolook.select.localized import Localized
 
@@ -385,6 +385,8 @@ class WhereToLook:
         if not is_probability(self.scorer.name):
             fix = "Use the method set, or another learned one."
             raise ConfigError("the scores of this method are no probabilities", value=self.scorer.name, fix=fix)
+        from wheretolook.extend.audit import Audit  # imports pandas, which scores do not need
+
         check_names("option of audit", options, TargetOptions, ("at", "heading_deg"))
         request = TargetOptions(**options)
         if request.height_m and isinstance(self.space, MappedSpace):
@@ -456,6 +458,8 @@ class WhereToLook:
             MapError: no photograph registers in the map.
             TableError, ConfigError, SceneError: as `audit`; n is below 1, or a share is none.
         """
+        from wheretolook.extend.plan import Planner
+
         check_extension(n, until, least_p)
         audit = self.audit(at, heading_deg, **options)
         request = TargetOptions(**options)

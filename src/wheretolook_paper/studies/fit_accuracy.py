@@ -31,7 +31,7 @@ from wheretolook.dataset.viewpoint_table import CAMERA_ID, LOCALIZED, poses
 from wheretolook.evaluation.statistics import expected_calibration_error
 from wheretolook.geometry.poses import Float
 from wheretolook.localization.confidence import RIGHT_PLACE_LIMITS
-from wheretolook.scorers.adapted.calibration import finite_log_odds
+from wheretolook.scorers.base import finite_log_odds
 from wheretolook.scorers.set.accuracy import MARGIN, STATISTICS, AccuracyModel, LogError, probabilities, statistics_of
 from wheretolook.scorers.set.score import SetScorer
 from wheretolook_paper.studies.fit_confidence import ACCURACIES, is_within

@@ -47,7 +47,7 @@ from wheretolook.mapping.rendered_map import plan_walk
 from wheretolook.rendering.appearance import Appearance
 from wheretolook.rendering.warp_renderer import WarpRenderer
 from wheretolook.scenes.loading import load_mesh
-from wheretolook.scorers.adapted.calibration import finite_log_odds
+from wheretolook.scorers.base import finite_log_odds
 from wheretolook.scorers.set.accuracy import MARGIN, STATISTICS, LogError, PhotographModel, statistics_of
 from wheretolook.scorers.set.network import MAPPED_DEVIATIONS
 from wheretolook.scorers.set.score import SetScorer

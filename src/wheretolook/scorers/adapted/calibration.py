@@ -6,9 +6,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass, fields
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from scipy.optimize import minimize
-from scipy.special import expit, logit
+from scipy.special import expit
 
 from wheretolook.geometry.poses import Float
 
@@ -110,8 +110,3 @@ def splits(views: LocalizedViews, seed: int = 0) -> Iterator[tuple[NDArray[np.bo
 def log_losses(log_odds: Float, good: NDArray[np.bool_]) -> Float:
     """Return the negative log-likelihood (B,) of whether each view localizes."""
     return np.asarray(np.logaddexp(0.0, np.where(good, -log_odds, log_odds)))
-
-
-def finite_log_odds(probability: ArrayLike, margin: float) -> NDArray[np.float64]:
-    """Return log-odds (...,) of probabilities (...,) in [0, 1], clipped to `margin` .. 1 - `margin` so that they are finite."""
-    return np.asarray(logit(np.clip(probability, margin, 1 - margin)))

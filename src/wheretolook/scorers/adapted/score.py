@@ -15,8 +15,7 @@ from scipy.special import expit
 from wheretolook.geometry.poses import Float, check_locations
 from wheretolook.geometry.views import Views
 from wheretolook.inputs.localization_map import LocalizationMap
-from wheretolook.scorers.adapted.calibration import finite_log_odds
-from wheretolook.scorers.base import Scorer
+from wheretolook.scorers.base import Scorer, finite_log_odds
 from wheretolook.scorers.registry import BuildOptions
 from wheretolook.scorers.set.network import SetNetwork
 from wheretolook.scorers.set.score import SetScorer

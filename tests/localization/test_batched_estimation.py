@@ -210,6 +210,25 @@ def test_images_without_a_pose_have_the_status_of_single_images(landmarks):
         assert localizer.estimate_batch(images[0][:1], images[0][1:])[0].status == TOO_FEW_MATCHES
 
 
+@pytest.mark.parametrize("method", ["first", "hypotheses"])
+def test_a_map_of_fewer_landmarks_than_nearest_ones(landmarks, method):
+    rows = np.flatnonzero(np.isfinite(landmarks.points).all(1))[:12]
+    rng = np.random.default_rng(0)
+    points = rng.uniform((3, -1, -1), (5, 1, 1), (12, 3))
+    values = {name: v[rows] if isinstance(v, np.ndarray) else v for name, v in vars(landmarks).items()}
+    localizer = Localizer(Landmarks(**{**values, "points": points}), CAMERA, LocalizerConfig(method))
+    (pose,) = poses_looking_along([[0.0, 0.0, 0.0]], [[1.0, 0.0, 0.0]])
+    seen, pixels = in_view(points, pose, CAMERA)
+    right = Keypoints(pixels.astype(np.float32), landmarks.descriptors[rows[seen]].astype(np.float32) / 512)
+    others = rng.gamma(0.5, 1, right.descriptors.shape).astype(np.float32)  # like many landmarks alike
+    more = Keypoints(np.tile(right.pixels, (2, 1)), np.concatenate([right.descriptors, others]))
+    localizer.in_batches = True
+    keypoints = [right, more]
+    for found in localizer.estimate_batch(keypoints, localizer.match(keypoints)):
+        assert found.status == LOCALIZED and len(found.inlier_rows) == len(seen)
+        assert max(pose_error(found.cam_from_world, pose)) < 1e-3
+
+
 def test_views_are_labelled_alike_in_batches(room, views):
     """The whole chain, from rendering to labels, on views of which some localize."""
     tables = []

@@ -32,7 +32,7 @@ from wheretolook.mapping.map import Map
 from wheretolook.mapping.map_frame import MapFrame
 from wheretolook.robot.export import export_localizer, export_robot
 from wheretolook.robot.localizer import ImageSequence, RobotLocalizer
-from wheretolook.robot.wheretolook_robot import RobotScorer
+from wheretolook.robot.wheretolook_robot import RobotScorer, description_digest
 from wheretolook.scorers.base import Scorer
 from wheretolook.utils.errors import ConfigError, MapError
 from wheretolook.utils.package import shipped
@@ -252,6 +252,11 @@ def test_a_folder_of_another_version_is_rejected(folder, tmp_path):
     with pytest.raises(FileNotFoundError, match=r"mean_scores.*Export again"):
         RobotLocalizer(old)
     about = json.loads((old / "robot.json").read_text())
+    del about["calibration"], about["sha256"]
+    about["files"] = {name: digest for name, digest in about["files"].items() if name != "mean_scores.npy"}
+    (old / "robot.json").write_text(json.dumps(about | {"sha256": description_digest(about)}))
+    with pytest.raises(ValueError, match="without calibration"):
+        RobotLocalizer(old)
     (old / "robot.json").write_text(json.dumps(about | {"format_version": 0}))
     with pytest.raises(ValueError, match=r"reads format 2\. Export again"):
         RobotLocalizer(old)

@@ -168,9 +168,8 @@ def test_it_is_added_for_photographs_only_and_to_a_copy():
     noise_px = max(0.1, localization_map.landmarks.keypoint_noise_px)
     assert calibrated.of_map.error_scale == pytest.approx(noise_px)
     assert calibrated.of_map.log_error_scale_error is None  # without keypoints
-    landmarks = replace(
-        localization_map.landmarks, reprojection_error_px=np.full(len(localization_map.landmarks), np.nan)
-    )
+    landmarks = localization_map.landmarks
+    landmarks = replace(landmarks, reprojection_error_px=np.resize([np.nan, np.inf, 0.0], len(landmarks)))
     unknown = replace(localization_map, map=replace(localization_map.map, landmarks=landmarks))
     with pytest.warns(MapWarning, match="reprojection error"):
         assert for_map(trained, unknown).of_map.error_scale == pytest.approx(1.0)

@@ -158,6 +158,7 @@ class BatchedEstimator:
         order = torch.where(allowed, squared.flatten(2), torch.inf).argsort(stable=True)
         order = order[..., : int(allowed.sum(-1).max())]
         near = self._padded([found.near for _, found in views]).flatten(2).gather(-1, order)
+        near = near.clamp(max=len(self.points) - 1)  # few landmarks leave rows without one
         seen = torch.take_along_dim(keypoints, order[..., None] // number, 2)
         candidates = MatchBatch(self.points[near], torch.where(allowed.gather(-1, order)[..., None], seen, FAR), focal)
         groups = [torch.unique(x, return_inverse=True) for x in (order // number, near)]

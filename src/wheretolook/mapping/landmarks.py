@@ -71,9 +71,10 @@ class Landmarks:
         The median over landmarks of at least three observations of their mean reprojection error over that of normal
         noise, sqrt(pi / 2). A track of n keypoints has 2 n coordinates, and determines 3.
         """
-        known = (self.track_length >= 3) & (self.reprojection_error_px > 0)  # 0 and NaN are unknown
+        errors = self.reprojection_error_px
+        known = (self.track_length >= 3) & (errors > 0) & (errors < np.inf)  # 0, NaN and infinity are unknown
         n = self.track_length[known].astype(np.float64)
-        noise = self.reprojection_error_px[known] * np.sqrt(4 * n / (np.pi * (2 * n - 3)))
+        noise = errors[known] * np.sqrt(4 * n / (np.pi * (2 * n - 3)))
         return float(np.median(noise)) if len(n) else None
 
     def attributes(self) -> NDArray[np.float32]:

@@ -124,6 +124,8 @@ class RobotLocalizer:
         expected = ExpectedLandmarks.of(points, directions, attributes, about["map_attributes"])
         if "descriptors.npy" not in about["files"]:
             raise ValueError(f"{folder}: exported without descriptors. Export again with --localize.")
+        if "calibration" not in about:
+            raise ValueError(f"{folder}: exported by an earlier version, without calibration. Export again.")
         descriptors = np.load(folder / "descriptors.npy", allow_pickle=False)
         padded = -(-max(len(points), NEAREST * GROUP) // GROUP) * GROUP
         self.n_landmarks = len(points)
@@ -131,7 +133,7 @@ class RobotLocalizer:
         self._descriptors[:, : len(points)] = descriptors.T
         self._twins = descriptors if has_twins(self, descriptors, points) else None
         self._config = LocalizerConfig(method="hypotheses")
-        estimator = PoseEstimator(points, self._config, about.get("calibration") is not None)
+        estimator = PoseEstimator(points, self._config, about["calibration"] is not None)
         self._localizer = JointLocalizer(estimator, turn_noise_deg, True, expected)
         self._points = points
         self._mapping_distance_m = np.exp(distance)

@@ -154,6 +154,7 @@ def test_a_pose_is_found_with_every_camera(room, camera):
         (True, "cuda:0", {}),
         (False, "cpu", {}),
         (False, "cuda", {"extractor": ExtractorConfig("colmap")}),
+        (False, "cuda", {"extractor": ExtractorConfig("aliked")}),
         (False, "cuda", {"appearance": 0.6}),
         (
             False,

@@ -114,6 +114,8 @@ class SampleConfig(ViewLattice):
         if self.near_map and not self.max_locations:
             fix = "Set sample.max_locations."
             raise ConfigError("near_map is a share of max_locations, which is 0", value=self.near_map, fix=fix)
+        if self.any_lens and not self.cameras:
+            raise ConfigError("any_lens draws cameras, of which there are none", value=True, fix="Set sample.cameras.")
         if isinstance(self.max_directions, dict) and set(self.max_directions) != set(get_args(Split)):
             fix = "Give one number, or one for each of train, val and test."
             raise ConfigError("sample.max_directions lacks or misnames a split", value=self.max_directions, fix=fix)

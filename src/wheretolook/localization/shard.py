@@ -110,9 +110,12 @@ class SceneJob:
 
     @property
     def on_gpu(self) -> bool:
-        """Whether all steps run on a GPU; appearances are those of a core, 0.3 s for two megapixels."""
+        """Whether all steps run on a GPU, where learned features keep several processes busy.
+
+        Appearances take a core 0.3 s for two megapixels.
+        """
         pinholes = all(isinstance(camera, PinholeCamera) for camera in (self.camera, *dict(self.cameras).values()))
-        on_cores = self.device == "cpu" or self.extractor.method == "colmap" or self.appearance > 0
+        on_cores = self.device == "cpu" or self.extractor.method != "opencv" or self.appearance > 0
         return pinholes and not on_cores
 
     @property

@@ -75,7 +75,9 @@ def test_near_map_and_keep_take_the_best_of_the_directions_near_those_of_images(
     assert best["visibility_rank"].max() >= 5  # not the five that see most of all
 
 
-@pytest.mark.parametrize(("options", "missing"), [({"near_map": 0.5}, "max_locations"), ({"any_lens": True}, "cameras")])
+@pytest.mark.parametrize(
+    ("options", "missing"), [({"near_map": 0.5}, "max_locations"), ({"any_lens": True}, "cameras")]
+)
 def test_options_that_need_another_one_are_refused_without(options, missing):
     with pytest.raises(ConfigError, match=missing):
         SampleConfig(**options)

@@ -238,13 +238,13 @@ class MapCalibration:
 
     def describe(self) -> str:
         """State the numbers for a summary."""
-        text = f"errors of poses as of keypoints of {self.error_scale:.2f} px"
+        text = f"calibration by the map's images: pose errors as by a keypoint noise of {self.error_scale:.2f} px"
         if self.log_error_scale_error is not None:
             text += f" (standard error {self.log_error_scale_error:.0%})"
         if self.error_spread is not None:
-            text += f", deviation of their logs {self.error_spread:.2f}"
+            text += f", with a deviation of their logs of {self.error_spread:.2f}"
         if self.detection_offset is not None:
-            text += f"; log-odds of detection {self.detection_offset:+.2f}"
+            text += f"; offset of the log-odds of detection {self.detection_offset:+.2f}"
         if self.detection_offset_error is not None:
             text += f" (standard error {self.detection_offset_error:.2f})"
         return text

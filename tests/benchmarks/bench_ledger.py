@@ -169,7 +169,7 @@ def main():
     rows = []
 
     def add(what, work, repeats):
-        times = seconds_of(work, repeats)
+        times = seconds_of(work, repeats, limit_s=3.0)
         rows.append({"when": date.today().isoformat(), "commit": commit(), "device": name, "what": what, **times})
         last = before.get(what)
         show(what, times, f"{times['median_s'] / last['median_s']:.2f} of {last['commit']}" if last else "first entry")
@@ -180,7 +180,7 @@ def main():
     with tempfile.TemporaryDirectory() as folder:
         for what, work in select(args, args.device, Path(folder)):
             add(what, work, max(1, args.repeats // 5))
-        add("check, 30 photographs, process", check(Path(folder, "corridor")), max(1, args.repeats // 10))
+        add("check, 30 photographs, process", check(Path(folder, "corridor")), max(1, args.repeats // 20))
     if args.record:
         earlier = [pd.read_csv(args.ledger, dtype={"commit": str})] if args.ledger.exists() else []
         write_csv(pd.concat([*earlier, pd.DataFrame(rows)[[*COLUMNS]]]), args.ledger)

@@ -49,16 +49,21 @@ def options(about, **defaults):
     return parser.parse_args()
 
 
-def seconds_of(work, repeats, clock=time.perf_counter):
-    """Return median, quartiles, minimum and maximum seconds over repeats, after one warm-up run."""
+def seconds_of(work, repeats, clock=time.perf_counter, limit_s=float("inf")):
+    """Return median, quartiles, minimum and maximum seconds over repeats, after one warm-up run.
+
+    After two repeats no other begins beyond a limit.
+    """
     work()
     seconds = []
-    for _ in range(repeats):
+    for n in range(repeats):
+        if n >= 2 and sum(seconds) > limit_s:
+            break
         start = clock()
         work()
         seconds.append(clock() - start)
     low, first, median, third, high = np.percentile(seconds, (0, 25, 50, 75, 100)).tolist()
-    return {"median_s": median, "q1_s": first, "q3_s": third, "min_s": low, "max_s": high, "repeats": repeats}
+    return {"median_s": median, "q1_s": first, "q3_s": third, "min_s": low, "max_s": high, "repeats": len(seconds)}
 
 
 def show(label, times, about=""):

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import logit
 
 from wheretolook.geometry.camera import Camera, ColmapCamera, describe_camera
 from wheretolook.geometry.poses import Float, check_poses, poses_looking_along
@@ -175,4 +174,5 @@ def same_field_of_view(trained: Camera, camera: Camera) -> bool:
 
 def finite_log_odds(probability: ArrayLike, margin: float) -> NDArray[np.float64]:
     """Return log-odds (...,) of probabilities (...,) in [0, 1], clipped to `margin` .. 1 - `margin` so that they are finite."""
-    return np.asarray(logit(np.clip(probability, margin, 1 - margin)))
+    clipped = np.clip(probability, margin, 1 - margin)
+    return np.asarray(np.log(clipped) - np.log1p(-clipped))

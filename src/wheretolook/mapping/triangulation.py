@@ -125,7 +125,7 @@ def triangulate_model(
 def estimate_poses(model: Any) -> None:
     """Adjust poses, focal length and points of a triangulated reconstruction in place, and align it with its old poses.
 
-    Images that observe no point keep their poses, and so do all images of a model without points.
+    Images that observe no point only follow the alignment. A model without points is left as it is.
     """
     images = [image for image in model.images.values() if image.num_points3D]
     if not images:

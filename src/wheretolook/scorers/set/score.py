@@ -127,9 +127,9 @@ def for_map(trained: TrainedNetwork[SetNetwork], localization_map: LocalizationM
 def error_scale(whole: Map) -> tuple[float, float | None]:
     """Return the scale of the errors of a map's poses, and the standard error of its log, None if tracks show none.
 
-    It is the map's keypoint noise in pixels, times a factor by its tracks.
-    The noise is at least a tenth of a pixel, less than that of SIFT: maps made from exact points have none. Of the log of
-    the factor, `log_error_ratio` over its mean of maps of photographs, 0.4 counts (docs/research/cameras.md).
+    It is the map's keypoint noise in pixels, times a factor by its tracks. The noise is at least a tenth of a pixel, less
+    than that of SIFT: maps made from exact points have none. Of the log of the factor, `log_error_ratio` over its mean of
+    maps of photographs, 0.4 counts (docs/research/cameras.md).
     """
     if "error_scale" not in whole.computed:
         noise_px = whole.landmarks.keypoint_noise_px
